@@ -16,7 +16,7 @@ from types import FrameType
 from typing import TYPE_CHECKING
 
 from dt_viz.evaluate.__main__ import main as evaluate
-from dt_viz.ui.logs import Terse
+from dt_viz.ui.logs import RateLimitFilter
 from dt_viz.ui.origins import Origin, OriginError
 
 if TYPE_CHECKING:
@@ -54,11 +54,11 @@ def _serve(options: argparse.Namespace) -> int:
     from dt_viz.learning.imitation import ImitationError  # noqa: PLC0415
     from dt_viz.learning.store import FitStore  # noqa: PLC0415
     from dt_viz.scenario.tasks import known_tasks  # noqa: PLC0415
-    from dt_viz.ui.gate import GateError  # noqa: PLC0415
+    from dt_viz.ui.patches import GateError  # noqa: PLC0415
     from dt_viz.ui.server import AddressError, Server  # noqa: PLC0415
 
     handler = logging.StreamHandler()
-    handler.addFilter(Terse())
+    handler.addFilter(RateLimitFilter())
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s", handlers=[handler])
     try:
         tasks = known_tasks(options.lasa)

@@ -1,8 +1,8 @@
-"""Warnings about results, as values: their kind decides which warning hides which."""
+"""Warnings about results, as values: their kind says how grave they are, what mends them and which ones they hide."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum, auto
 
@@ -10,75 +10,127 @@ ARM = "Arm"
 """Source of warnings about the shown arm, which are left out while it is hidden."""
 
 
+class Severity(Enum):
+    """Gravity of a result, or of a message."""
+
+    GOOD = auto()
+    """Every check is made, and holds."""
+    NOTE = auto()
+    """The warp is on its way, so that the checks say nothing."""
+    WARNING = auto()
+    """Something is not as it should be."""
+    ALARM = auto()
+    """There is a collision, or no motion."""
+
+
+class Concern(Enum):
+    """Subject of a problem, the gravest first."""
+
+    COLLISION = "collision"
+    INEXACT = "not exact"
+    TOO_CLOSE = "too close"
+    CAUTION = "caution"
+
+    @property
+    def severity(self) -> Severity:
+        """How grave it is."""
+        return Severity.ALARM if self is Concern.COLLISION else Severity.WARNING
+
+    @property
+    def gravity(self) -> int:
+        """Place among all concerns, 0 for the gravest."""
+        return list(Concern).index(self)
+
+
+class Mend(Enum):
+    """Remedy of a problem."""
+
+    INTEGRATION = auto()
+    """The automatic choice of the integrator, instead of one by hand."""
+    FLOW = auto()
+    """Another flow of the avoidance, or its being switched on."""
+    WHOLE_ARM = auto()
+    """Avoidance by the whole arm."""
+
+
 class Kind(Enum):
-    """Kind of a problem."""
+    """Kind of a problem, with its concern, its remedy if there is one, and the name of the kind that is its cause.
 
-    IMITATION = auto()
+    A warning is hidden by one of its cause.
+    """
+
+    concern: Concern
+    mend: Mend | None
+    cause: str
+
+    def __new__(cls, concern: Concern, mend: Mend | None = None, cause: str = "") -> Kind:
+        """Number the kinds in their order: several are alike."""
+        kind = object.__new__(cls)
+        kind._value_ = len(cls.__members__)
+        kind.concern, kind.mend, kind.cause = concern, mend, cause
+        return kind
+
+    @property
+    def of_meshes(self) -> bool:
+        """Whether it is about collisions of the meshes of the arm that is shown."""
+        return self in {Kind.ARM_ENTERS, Kind.ARM_HITS_ITSELF, Kind.ARM_BELOW_TABLE}
+
+    IMITATION = Concern.CAUTION
     """The demonstrations were not learned as they are."""
-    START_COVERED = auto()
+    START_COVERED = Concern.CAUTION
     """A motion starts inside an obstacle."""
-    GOAL_COVERED = auto()
+    GOAL_COVERED = Concern.CAUTION
     """The goal lies inside an obstacle."""
-    STAYS_INSIDE = auto()
+    STAYS_INSIDE = Concern.COLLISION, Mend.FLOW
     """No flow time leads a motion out of an obstacle."""
-    ENTERS = auto()
+    ENTERS = Concern.COLLISION, Mend.FLOW, "STAYS_INSIDE"
     """A motion enters an obstacle."""
-    TOO_NEAR = auto()
+    TOO_NEAR = Concern.TOO_CLOSE, Mend.FLOW
     """A motion keeps less than the margin from an obstacle."""
-    GOAL_MISSED = auto()
+    GOAL_MISSED = Concern.CAUTION, None, "GOAL_COVERED"
     """The motions end beside the goal."""
-    MISPLACED = auto()
+    MISPLACED = Concern.CAUTION
     """A transform stands at a place where it has no effect."""
-    OFF_PLANE = auto()
+    OFF_PLANE = Concern.CAUTION
     """A bias point of a drawing lies before or behind the drawing's plane."""
-    UNREACHED = auto()
+    UNREACHED = Concern.CAUTION
     """A transform does not lead every motion to its place."""
-    TARGET_MISSED = auto()
+    TARGET_MISSED = Concern.CAUTION
     """A motion gives way to an obstacle and passes beside a bias point."""
-    UNSAMPLED = auto()
+    UNSAMPLED = Concern.INEXACT
     """The motions are stretched too far to be drawn exactly."""
-    OUT_OF_REACH = auto()
+    OUT_OF_REACH = Concern.CAUTION
     """The arm cannot reach a place."""
-    PATH_MISSED = auto()
+    PATH_MISSED = Concern.CAUTION
     """The joints do not lead the hand along its path."""
-    NO_WAY = auto()
+    NO_WAY = Concern.CAUTION
     """The arm, free at its ends, finds no motion between them that does not touch an obstacle."""
-    ARM_BLOCKED = auto()
+    ARM_BLOCKED = Concern.CAUTION
     """The arm finds no way around an obstacle."""
-    ROLLOUT_ENTERS = auto()
+    ROLLOUT_ENTERS = Concern.COLLISION, Mend.FLOW
     """The arm, avoiding as a whole, enters an obstacle on some rollout."""
-    ARM_TOO_NEAR = auto()
+    ARM_TOO_NEAR = Concern.TOO_CLOSE, Mend.FLOW
     """The arm, avoiding as a whole, keeps less than the margin from an obstacle on some rollout."""
-    ARM_ENTERS = auto()
+    ARM_ENTERS = Concern.COLLISION, Mend.WHOLE_ARM, "ROLLOUT_ENTERS"
     """The arm that is shown enters an obstacle."""
-    ARM_HITS_ITSELF = auto()
+    ARM_HITS_ITSELF = Concern.TOO_CLOSE
     """The arm that is shown touches itself, nearly or indeed."""
-    ARM_BELOW_TABLE = auto()
+    ARM_BELOW_TABLE = Concern.COLLISION
     """The arm that is shown goes through the table."""
-    DAMPED = auto()
+    DAMPED = Concern.CAUTION
     """The pseudo-inverse of the arm's Jacobian is damped."""
-    FOLDS = auto()
+    FOLDS = Concern.INEXACT, Mend.INTEGRATION
     """A step of an integrator that was chosen by hand folds space."""
-    INEXACT_INVERSE = auto()
+    INEXACT_INVERSE = Concern.INEXACT, Mend.INTEGRATION
     """An integrator that was chosen by hand does not come back to where it began."""
-    NO_DIFFEOMORPHISM = auto()
+    NO_DIFFEOMORPHISM = Concern.INEXACT, None, "FOLDS"
     """Certificate: det J is not positive."""
-    ROUND_TRIP = auto()
+    ROUND_TRIP = Concern.INEXACT, None, "INEXACT_INVERSE"
     """Certificate: ψ⁻¹(ψ(y)) is not y."""
-    NOT_FALLING = auto()
+    NOT_FALLING = Concern.INEXACT, None, "FOLDS"
     """Certificate: the Lyapunov value does not fall."""
-    OFF_MOTION = auto()
+    OFF_MOTION = Concern.INEXACT
     """Certificate: the shown motion is no image of the base motion."""
-
-
-CONSEQUENCES: Mapping[Kind, frozenset[Kind]] = {
-    Kind.GOAL_COVERED: frozenset({Kind.GOAL_MISSED}),
-    Kind.STAYS_INSIDE: frozenset({Kind.ENTERS}),
-    Kind.FOLDS: frozenset({Kind.NO_DIFFEOMORPHISM, Kind.NOT_FALLING}),
-    Kind.INEXACT_INVERSE: frozenset({Kind.ROUND_TRIP}),
-    Kind.ROLLOUT_ENTERS: frozenset({Kind.ARM_ENTERS}),
-}
-"""Kinds of warnings that are hidden by a warning of their cause."""
 
 
 @dataclass(frozen=True)
@@ -104,10 +156,7 @@ def told(warnings: Iterable[MotionWarning]) -> tuple[MotionWarning, ...]:
     return tuple(
         warning
         for warning in unique
-        if not any(
-            warning.kind in CONSEQUENCES.get(cause.kind, ()) and warning.source in {"", cause.source}
-            for cause in unique
-        )
+        if not any(warning.kind.cause == cause.kind.name and warning.source in {"", cause.source} for cause in unique)
     )
 
 

@@ -23,13 +23,15 @@ from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Frame, Stage
+from dt_viz.session.jobs import Jobs
 from dt_viz.session.robot_loop import LiveArm
 from dt_viz.session.session import Session
+from dt_viz.ui.bindings import EDITS, Bindings
 from dt_viz.ui.controls import Control
-from dt_viz.ui.panel.bindings import Bindings
-from dt_viz.ui.panel.panel import ControlPanel
+from dt_viz.ui.panel import ControlPanel
 from dt_viz.ui.scene.tripod import Tripod
 from dt_viz.ui.visitor import Visitor
+from dt_viz.warning import Severity
 
 MIDDLE = (0.1, -0.5, 0.4)
 TITLES = {name: entry.title for name, entry in TASKS.items()}
@@ -157,7 +159,6 @@ class Page:
         self.scene._get_client_handle = lambda _id: self.client  # type: ignore[method-assign]
         self.visitor = Visitor(cast(Any, self.client), cast(Engine, NoFrames()), robot, TITLES, "draw_s")
         self._loop = asyncio.new_event_loop()
-        self.visitor._panel._chores.later(lambda: None)  # begins its thread now, not in the test that first needs it
         self.session = self.visitor.session
         self._initial = self.session.scenario
 
@@ -242,7 +243,7 @@ class Page:
 
     def done(self) -> None:
         """Wait until the work of buttons is done."""
-        self.visitor._panel._chores._executor.submit(lambda: None).result(PATIENCE)
+        assert self.session.jobs.wait_idle(EDITS, PATIENCE)
 
     def begin(self, scenario: Scenario) -> None:
         self.session.edit("test", **all_of(scenario))
@@ -297,14 +298,20 @@ class Edited:
         self.scenario, self.task, self._panel = scenario, TASKS[scenario.task](), panel
         self.steps = 0
         """For undo."""
+        self.said: list[tuple[str, Severity]] = []
+        self.jobs = Jobs(lambda error: self.say(str(error), Severity.ALARM))
         self._adopt()
 
     def edit(self, _gesture: str, **changes: Any) -> None:
         self.scenario = replace(self.scenario, **changes)
         self._adopt()
 
-    def end_gesture(self) -> None:
+    def step(self, gesture: str, **changes: Any) -> None:
+        self.edit(gesture, **changes)
         self.steps += 1
+
+    def say(self, text: str, severity: Severity) -> None:
+        self.said.append((text, severity))
 
     def _adopt(self) -> None:
         if self._panel is not None:

@@ -2,6 +2,7 @@
 
 import ast
 import graphlib
+import re
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
@@ -112,7 +113,12 @@ def test_a_module_imports_only_what_is_below_it(path):
 def test_what_lies_in_the_scene_knows_no_controls():
     in_scene = [path for path in SOURCES if path.is_relative_to(PACKAGE / "ui" / "scene")]
     assert in_scene
-    assert not [name for path in in_scene for name in our_modules(path) if name.startswith("dt_viz.ui.panel")]
+    assert not [
+        name
+        for path in in_scene
+        for name in our_modules(path)
+        if name.startswith(("dt_viz.ui.panel", "dt_viz.ui.tabs"))
+    ]
 
 
 def test_neither_modules_nor_packages_import_each_other_in_a_circle():
@@ -124,6 +130,12 @@ def test_only_the_page_talks_to_the_browser():
     found = importers("viser")
     assert found
     assert all(name.startswith("ui/") for name in found - {"examples/viser_scene.py"})
+
+
+def test_what_viser_keeps_to_itself_is_used_in_one_file():
+    private = re.compile(r"viser\._(?!_)|\._impl\b|\._queue_update\b|\._websock|websockets\.asyncio\.server\.serve")
+    page = [path for path in SOURCES if path.parent in {PACKAGE / "ui", PACKAGE / "ui" / "tabs"}]
+    assert [path.name for path in page if private.search(path.read_text(encoding="utf-8"))] == ["patches.py"]
 
 
 @pytest.mark.parametrize("module", ONLY_IMPORTERS)

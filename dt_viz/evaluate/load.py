@@ -58,7 +58,7 @@ from dt_viz.evaluate.protocol_client import ANSWERED, ROLLOUT, LostError, Protoc
 from dt_viz.flows.fields import Array
 from dt_viz.obstacles.shapes import Point, as_point
 from dt_viz.scenario.tasks import Task
-from dt_viz.ui.panel.avoid import OFF, SPACES
+from dt_viz.ui.panel import OFF, SPACES
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 from dt_viz.avoidance.avoidance import ArmAvoidance, Avoidance
 from dt_viz.avoidance.hand import HandAvoidance
@@ -33,66 +33,118 @@ MAX_MARGIN = 0.05
 
 
 @dataclass(frozen=True)
+class Offer:
+    """How the page offers a field of `View`."""
+
+    label: str
+    hint: str | None = None
+
+
+def _offered(default: Any, label: str, hint: str | None = None) -> Any:  # noqa: ANN401
+    return field(default=default, metadata={"offer": Offer(label, hint)})
+
+
+@dataclass(frozen=True)
 class View:
     """View of a result; changing it moves nothing."""
 
-    demonstrations: bool = True
-    rollouts: bool = True
-    ghost: bool = True
+    demonstrations: bool = _offered(True, "Demonstrations")
+    rollouts: bool = _offered(True, "Rollouts")
+    ghost: bool = _offered(True, "Undisturbed motions", "what was learned, without obstacles and bias points")
     """The undeformed rollouts."""
-    field: bool = True
+    field: bool = _offered(True, "Vector field", "velocities on the slice: longer and darker is faster")
     """Arrows of the vector field on the slice."""
-    streamlines: bool = False
+    streamlines: bool = _offered(
+        False,
+        "Streamlines",
+        "motions from all over the slice, exact; of an augmented motion the lines of its field at one phase, which no "
+        "motion follows for long",
+    )
     """Motions through places all over the slice."""
     slice: SlicePose | None = None
     """Pose of the slice; None is the task's."""
-    move_slice: bool = False
+    move_slice: bool = _offered(
+        False, "Move the slice", "handles that move and tilt the slice, the plane on which arrows and colours are shown"
+    )
     """Whether the slice has handles, instead of obstacles and bias points."""
     colour: SliceColour = "none"
-    phase: float = 1.0
+    phase: float = _offered(
+        1.0,
+        "Phase",
+        "of an augmented motion, whose field changes on the way: the part of it that is left, from 1 at its start to "
+        "0 at the goal, for which vector field, streamlines, grid and colours are shown",
+    )
     """Part of a motion that is left, from 1 at its start to 0 at the goal, at which augmented motions are shown on the
     slice: at each phase they have another field."""
-    arm: bool = True
-    ghost_arm: bool = False
+    arm: bool = _offered(True, "Arm")
+    ghost_arm: bool = _offered(False, "Arm without avoidance", "at the same moment; links that coincide are left out")
     """The arm where it would be without avoidance."""
-    onion: bool = False
+    onion: bool = _offered(
+        False, "Arms along the motion", "several, from start to goal, evenly along the path of the hand"
+    )
     """Several arms along the motion, fading."""
-    body_points: bool = False
+    body_points: bool = _offered(
+        False, "Body points", "spheres that cover the arm; lines from where each would be without avoidance"
+    )
     """The spheres that cover the arm, and how far avoidance has moved each."""
-    joint_plots: bool = False
+    joint_plots: bool = _offered(False, "Joint plots", "angles and speeds over time, with their limits")
     """Joint angles and speeds over time, with their limits."""
-    health_plots: bool = False
+    health_plots: bool = _offered(
+        False,
+        "Plots along the path",
+        "Lyapunov value, distance to the demonstration and clearance along the arm's rollout",
+    )
     """Lyapunov value, distance to the demonstration and clearance along the rollout that the arm follows."""
     compared: tuple[str, ...] = ()
     """Names of methods whose motions are shown beside ours."""
     their_arm: str = ""
     """Name of the one of them whose arm is shown, too; none if empty."""
-    table: bool = True
+    table: bool = _offered(True, "Table")
     selected: int = 0
     """Number of the obstacle that the panel changes; if there are fewer, it is the last one."""
-    handles: bool = False
+    handles: bool = _offered(
+        False,
+        "Handles",
+        "arrows and arcs that move and turn it along axes; a click on an obstacle shows and hides them",
+    )
     """Whether that has handles, which move and turn it along axes."""
-    generator: bool = False
+    generator: bool = _offered(False, "Learned generator", "vector field whose flow is the imitation")
     """Arrows of the learned generator, the vector field whose flow is ψ."""
-    generator_layer: int = 0
+    generator_layer: int = _offered(
+        0,
+        "Generator of flow",
+        "the imitation is several flows, one after the other: 1 is the first; 0: the mean of all",
+    )
     """Number of the flow of ψ that is shown: 1 is applied first; 0 is the mean of all over time."""
-    grid: bool = False
+    grid: bool = _offered(
+        False,
+        "Warped grid ψ⁻¹(grid)",
+        "straight lines of base space, as all transforms together bend them",
+    )
     """The warped grid: lines of base space seen through ψ⁻¹."""
-    panels: tuple[Panel, ...] = ()
+    panels: tuple[Panel, ...] = _offered(
+        (), "Stack side by side", "the base attractor, with motions straight to the goal, and each level of the stack"
+    )
     """Systems beside the scene, such as the base attractor."""
-    click_to_start: bool = False
+    click_to_start: bool = _offered(
+        False, "Click to start a rollout", f"on the slice, up to {MAX_STARTS}; drag a ball to move it"
+    )
     """Whether a click on the slice adds a start."""
     start_label: float | None = None
     """Label that new starts get; see `Start`."""
     playing: bool = True
     """Whether the arm moves."""
-    replay: bool = False
+    replay: bool = _offered(False, "Replay", "its motion again and again, finished, instead of an arm that reacts")
     """Whether the arm repeats its motion along its rollout, instead of being driven from where it is."""
-    speed: float = 1.0
+    speed: float = _offered(1.0, "Speed", "of the arm: 1 is real time")
     """Speed of the arm's time, relative to real time."""
     bias: str = ""
     """Name of the bias point that the panel changes; the newest if empty."""
-    bias_handles: bool = False
+    bias_handles: bool = _offered(
+        False,
+        "Handles",
+        "arrows that move it along axes, and a ring around its region; a click on it shows and hides them",
+    )
     """Whether that has handles and a ring around its region."""
     tuned: str = ""
     """Name of the transform of the stack whose settings the panel shows; the outermost if empty."""
@@ -120,6 +172,12 @@ class View:
             "compared": self.compared and (self.compared, self.their_arm),
         }
         return {name: choices for name, choices in wanted.items() if choices}
+
+
+OFFERS: Mapping[str, Offer] = {
+    name: declared.metadata["offer"] for name, declared in View.__dataclass_fields__.items() if declared.metadata
+}
+"""How the page offers fields of `View`, by their names."""
 
 
 @dataclass(frozen=True)

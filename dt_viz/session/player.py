@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from dt_viz.scenario.scenario import Scenario
@@ -12,66 +12,46 @@ from dt_viz.session.session import Session
 
 STEP = 0.05
 """Interval of the edits, seconds, as of a dragged slider."""
+LANE = "player"
+"""Lane of the session's jobs on which one thing is played at a time, the one that was started last."""
 
 Play = Callable[[Scenario, float], Mapping[str, Any] | None]
 """Function of the scenario and of the seconds since it began; it returns the fields that change, or None at the end."""
 
 
-class Player:
-    """Plays one thing at a time, as one gesture for undo."""
+def start(
+    session: Session, gesture: str, play: Play, changed: Callable[[bool], None], *, returns: bool = False
+) -> None:
+    """Begin to play, as one gesture for undo.
 
-    def __init__(self, changed: Callable[[bool], None]) -> None:
-        """Wait to be started.
+    Args:
+        session: whose scenario changes.
+        gesture: name of the edits.
+        play: what is played.
+        changed: called with True when playing begins and with False when it ends.
+        returns: whether the motion is in the end as it was before, unless somebody else has changed it.
+    """
+    session.jobs.submit(LANE, partial(_play, session, gesture, play, changed, returns), latest=True)
 
-        Args:
-            changed: called with True when playing begins and with False when it ends.
-        """
-        self._changed = changed
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
 
-    @property
-    def playing(self) -> bool:
-        """Whether it is under way."""
-        return self._thread is not None and self._thread.is_alive()
+def stop(session: Session) -> None:
+    """Stop what is played after the current edit."""
+    session.jobs.submit(LANE, lambda: None, latest=True)
 
-    def start(self, session: Session, gesture: str, play: Play, *, returns: bool = False) -> None:
-        """Begin to play. Nothing is done while something is played.
 
-        Args:
-            session: whose scenario changes.
-            gesture: name of the edits.
-            play: what is played.
-            returns: whether the motion is in the end as it was before, unless somebody else has changed it.
-        """
-        if not self.playing:
-            self._stop.clear()
-            arguments = (session, gesture, play, returns)
-            self._thread = threading.Thread(target=self._play, args=arguments, name=gesture, daemon=True)
-            self._thread.start()
-
-    def stop(self) -> None:
-        """Stop playing after the current edit."""
-        self._stop.set()
-
-    def close(self) -> None:
-        """Stop, and wait for the last edit."""
-        self.stop()
-        if self._thread is not None:
-            self._thread.join(timeout=1)
-
-    def _play(self, session: Session, gesture: str, play: Play, returns: bool) -> None:
-        self._changed(True)
-        session.begin_gesture()
-        before, mine, began = session.scenario, None, time.monotonic()
-        while mine is None or session.scenario.choices == mine.choices:  # else the user edits something
-            changes = play(session.scenario, time.monotonic() - began)
-            if changes is not None:
-                session.edit(gesture, **changes)
-                mine = session.scenario
-            if changes is None or self._stop.wait(STEP):
-                if returns:
-                    session.edit(gesture, stack=before.stack)
-                session.end_gesture()
-                break
-        self._changed(False)
+def _play(session: Session, gesture: str, play: Play, changed: Callable[[bool], None], returns: bool) -> None:
+    changed(True)
+    session.begin_gesture()
+    before, mine, began = session.scenario, None, time.monotonic()
+    while mine is None or session.scenario.choices == mine.choices:  # else the user edits something
+        changes = play(session.scenario, time.monotonic() - began)
+        if changes is not None:
+            session.edit(gesture, **changes)
+            mine = session.scenario
+            session.jobs.rest(LANE, STEP)
+        if changes is None or session.jobs.superseded(LANE):
+            if returns:
+                session.edit(gesture, stack=before.stack)
+            session.end_gesture()
+            break
+    changed(False)

@@ -8,9 +8,9 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 from dt_viz.avoidance.passing import ANEW
 from dt_viz.errors import DataError, UnwantedError
@@ -20,9 +20,11 @@ from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import IMITATION, as_fresh
 from dt_viz.scenario.tasks import Task
 from dt_viz.session.engine import Engine
-from dt_viz.session.frame import Frame, Stage
+from dt_viz.session.frame import Stage
 from dt_viz.session.history import History
-from dt_viz.session.worker import LatestWorker
+from dt_viz.session.jobs import Jobs
+from dt_viz.session.progress import Display, Message, Pace, Progress
+from dt_viz.warning import Severity
 
 logger = logging.getLogger(__name__)
 
@@ -33,20 +35,8 @@ HABITS = ("playing", "replay", "speed", "joint_plots", "health_plots")
 """Fields of the view that are a visitor's way of working, and stay when a scene of the paper comes or goes."""
 REST = 0.1
 """Time that a scenario must rest before it is refined, seconds: while a hand moves, edits come faster."""
-
-
-@dataclass(frozen=True)
-class Pace:
-    """How rebuilding goes."""
-
-    latency: float
-    """Time from the last edit until its live frame was ready, seconds."""
-    rate: float
-    """Live frames in the last second."""
-    num_skipped: int
-    """Edits that a newer one overtook, since the session began."""
-
-
+LANE = "session"
+"""Lane of the jobs on which the newest scenario is computed."""
 _Job = tuple[Scenario, float]
 """A scenario to compute, and when it was asked for, seconds."""
 
@@ -59,27 +49,8 @@ def _with_a_level_of_its_own(scenario: Scenario) -> Scenario:
     return replace(scenario, view=replace(scenario.view, level=""))
 
 
-class Display(Protocol):
-    """Receiver of a session's results: a page, or a measurement."""
-
-    def draw(self, frame: Frame, pace: Pace) -> None:
-        """Show a frame. Called on the worker thread, in the order of the edits."""
-
-    def adopt(self, scenario: Scenario) -> None:
-        """Show the scenario's choices on the controls, and what is to be visible."""
-
-    def learning(self, fraction: float, message: str) -> None:
-        """Show how far learning a task is, from 0 to 1."""
-
-    def fail(self, error: Exception) -> None:
-        """Show that the scenario could not be computed, and why."""
-
-    def cancelled(self, task: str) -> None:
-        """Show that learning this task was cancelled. What is adopted was shown before."""
-
-
 class Session:
-    """A scenario with its history, and the worker that computes its frames."""
+    """A scenario with its history, and the jobs that compute its frames."""
 
     def __init__(self, engine: Engine, initial: Callable[[str], Scenario], task: str, display: Display) -> None:
         """Start with a task.
@@ -99,17 +70,18 @@ class Session:
         self._history = History()
         self._unadopted = False
         """Whether the scenario was edited by a drag and is not shown on the controls yet."""
-        self._learning = self._stopped = self._closed = False
-        self._failed = False
-        """Whether the last computation ended by an error, so that what is shown is not all that the scenario asks for.
-        """
+        self._stopped = self._closed = False
+        self._telling = threading.RLock()
+        self._progress = Progress(self.scenario)
         self._shown: Scenario | None = None
         self._passing = ANEW
         """How the motions that are shown pass the obstacles."""
         self._latency = 0.0
         self._live_frames: deque[float] = deque(maxlen=120)
-        self._worker = LatestWorker[_Job](self._compute, display.fail, name="session")
-        display.adopt(self.scenario)
+        self._num_skipped = 0
+        self.jobs = Jobs(self.fail)
+        """All work of the visitor beside the server's event loop."""
+        self._adopt()
         self._submit()
 
     @property
@@ -127,12 +99,13 @@ class Session:
         """
         with self._lock:
             edited = _with_a_level_of_its_own(replace(self.scenario, **changes))
-            if edited == self.scenario and not self._failed:
+            failed = self._progress.failed
+            if edited == self.scenario and not failed:
                 return
             if edited.full != self.scenario.full:
                 edited = replace(edited, passing=ANEW if anew else None)
             self._history.edited(gesture, self.scenario, edited)
-            needs_frames = self._failed or not edited.computes_like(self.scenario)
+            needs_frames = failed or not edited.computes_like(self.scenario)
             self.scenario = edited
             if needs_frames:
                 self._submit()
@@ -141,6 +114,11 @@ class Session:
         if not self._unadopted:
             self._adopt()
 
+    def step(self, gesture: str, **changes: Any) -> None:  # noqa: ANN401 - the fields of Scenario
+        """Edit as `edit` does, as a step of its own for undo."""
+        self.edit(gesture, **changes)
+        self.end_gesture()
+
     def begin_gesture(self) -> None:
         """The user took hold of something: edits until `end_gesture` are undone together, however slow."""
         with self._lock:
@@ -148,8 +126,7 @@ class Session:
 
     def take_phase(self) -> None:
         """Show augmented motions on the slice at the phase at which the arm is."""
-        self.edit("phase", view=replace(self.scenario.view, phase=round(self._engine.arm.left, 2)))
-        self.end_gesture()
+        self.step("phase", view=replace(self.scenario.view, phase=round(self._engine.arm.left, 2)))
 
     def end_gesture(self) -> None:
         """The user let go: the next edit is a step of its own for undo. What ends as it began is no step."""
@@ -168,7 +145,7 @@ class Session:
             if self.scenario.scene:  # of the paper: leaves nothing behind
                 self._begin("task", self._as_seen(fresh))
                 return
-            self.edit(
+            self.step(
                 "task",
                 task=name,
                 arm_rollout=0,
@@ -176,7 +153,6 @@ class Session:
                 stack=as_fresh(self.scenario, fresh),
                 view=replace(self.scenario.view, slice=None),
             )
-            self.end_gesture()
 
     def reset(self) -> None:
         """Back to how the task or the scene began, and was looked at; the motion's part of it can be undone."""
@@ -198,8 +174,7 @@ class Session:
 
     def _begin(self, gesture: str, fresh: Scenario) -> None:
         changes = {name: getattr(fresh, name) for name in fresh.__dataclass_fields__ if name != "passing"}
-        self.edit(gesture, anew=True, **changes)
-        self.end_gesture()
+        self.step(gesture, anew=True, **changes)
 
     def _as_seen(self, other: Scenario) -> Scenario:
         """Another scenario, looked at as this one, on the slice that it had.
@@ -228,20 +203,40 @@ class Session:
         """Stop learning a task and go back to what was shown before. Nothing is done while nothing is learned."""
         with self._lock:
             abandoned = self.scenario
-            if not self._learning or (self._shown is not None and abandoned.fit == self._shown.fit):
+            learning = self._progress.learning is not None
+            if not learning or (self._shown is not None and abandoned.fit == self._shown.fit):
                 return
             self._stopped = not self._retreat(abandoned)
         self._adopt()
-        self._display.cancelled(abandoned.task)
+        instead = "Choose another task, or move the obstacle to start again."
+        if self._shown is not None:
+            instead = f"This is “{self.task.title}” as before."
+        title = self._engine.task(abandoned.task).title
+        self._tell(learning=None)
+        self.say(f"Learning “{title}” was cancelled. {instead}", Severity.WARNING)
+
+    def expect(self, expected: bool) -> None:
+        """Take note that another task or scene is being read for this session, or no more."""
+        self._tell(expected=expected)
+
+    def say(self, text: str, severity: Severity) -> None:
+        """Show a message until another scenario is shown."""
+        self._tell(message=Message(text, severity, self.scenario))
+
+    def fail(self, error: Exception) -> None:
+        """Show what went wrong; what is shown stays."""
+        expected = isinstance(error, DataError | ImitationError)
+        self._tell(failed=True, learning=None)
+        self.say(str(error) if expected else f"{type(error).__name__}: {error}", Severity.ALARM)
 
     def wait_idle(self, timeout: float | None = None) -> bool:
         """Wait until the newest scenario is computed to the end; False if that took longer than `timeout` seconds."""
-        return self._worker.wait_idle(timeout)
+        return self.jobs.wait_idle(LANE, timeout)
 
     def close(self) -> None:
         """Stop computing and let go of everything."""
         self._closed = True
-        self._worker.close()
+        self.jobs.close()
 
     def _travel(self, moved: Callable[[Scenario], Scenario | None]) -> None:
         with self._lock:
@@ -257,6 +252,13 @@ class Session:
         with self._adopting:
             self._unadopted = False
             self._display.adopt(self.scenario)
+            self._tell(wanted=self.scenario)
+
+    def _tell(self, **changes: Any) -> None:  # noqa: ANN401 - the fields of Progress
+        """Change the progress and show it: one thread after the other, so that the newest is shown last."""
+        with self._telling:
+            self._progress = replace(self._progress, **changes)
+            self._display.tell(self._progress)
 
     def _catch_up(self) -> None:
         """Show what a drag has edited."""
@@ -277,18 +279,21 @@ class Session:
 
     def _submit(self) -> None:
         self._stopped = False
+        if self._progress.failed:
+            self._tell(failed=False)
         self._engine.see(self.scenario)
-        self._worker.submit((self.scenario, time.perf_counter()))
+        compute = partial(self._compute, (self.scenario, time.perf_counter()))
+        self._num_skipped += self.jobs.submit(LANE, compute, latest=True)
 
-    def _compute(self, job: _Job, superseded: Callable[[], bool]) -> None:
-        self._failed = False
+    def _compute(self, job: _Job) -> None:
+        superseded = partial(self.jobs.superseded, LANE)
         try:
             self._show_frames(job, superseded)
         except UnwantedError:
-            pass
+            raise
         except Exception as error:
             with self._lock:
-                self._failed = True
+                self._tell(failed=True)
                 returned = isinstance(error, DataError | ImitationError) and self._retreat(job[0])
                 if not returned and self.scenario != job[0] and not superseded():
                     self._submit()  # it was edited meanwhile, and seemed to need no frames of its own
@@ -296,15 +301,15 @@ class Session:
                 self._adopt()
             raise
         finally:
-            self._learning = False
+            if self._progress.learning is not None:
+                self._tell(learning=None)
 
     def _learn(self, scenario: Scenario, fraction: float, message: str) -> None:
         """Show how far learning is; end it when something else is to be learned, not when the obstacle moves."""
         with self._lock:
             if self._stopped or self._closed or self.scenario.fit != scenario.fit:
                 raise UnwantedError
-            self._learning = True
-        self._display.learning(fraction, message)
+        self._tell(learning=(fraction, message))
 
     def _decided(self, scenario: Scenario) -> Scenario:
         """The scenario with a passing: that of the motion that is shown, of the same fit, where none is decided yet."""
@@ -322,10 +327,10 @@ class Session:
         self._catch_up()
         for frame in self._engine.frames(scenario, partial(self._learn, scenario), superseded):
             now = time.perf_counter()
-            if self._learning:
+            if self._progress.learning is not None:
                 edited = now - frame.seconds  # learning is no rebuild
             drawn = self._shown is not None and scenario.choices == self._shown.choices
-            self._learning, self._shown, self._passing = False, scenario, frame.passing
+            self._shown, self._passing = scenario, frame.passing
             if frame.stage is Stage.ROLLOUTS and drawn:
                 continue  # it is only looked at in another way: the next stage is what changes
             if frame.stage <= Stage.LIVE:
@@ -333,16 +338,22 @@ class Session:
             if frame.stage is Stage.LIVE:
                 self._live_frames.append(now)
             rate = sum(now - t <= 1.0 for t in self._live_frames)
-            self._display.draw(frame, Pace(self._latency, rate, self._worker.num_skipped))
+            pace = Pace(self._latency, rate, self._num_skipped)
+            self._display.draw(frame, pace)
+            if frame.stage is not Stage.ROLLOUTS:  # the next stage is a few milliseconds away
+                with self._telling:
+                    message = self._progress.message
+                    kept = message if message is not None and message.scenario == scenario else None
+                    self._tell(shown=frame, pace=pace, learning=None, failed=False, message=kept)
             if frame.stage in (Stage.ROLLOUTS, Stage.FINE):
                 self._engine.drive(frame)
             if frame.stage is Stage.LIVE:
-                self._worker.rest(REST)
+                self.jobs.rest(LANE, REST)
             elif frame.stage is Stage.ROLLOUTS:
                 last = self._live_frames[-1] if self._live_frames else -math.inf
                 pause = last + max(LIVE_PAUSE, LIVE_LATENCIES * self._latency) - now
                 if pause <= 0:
                     continue  # the field is due, whatever is waiting
-                self._worker.rest(pause)
+                self.jobs.rest(LANE, pause)
             if superseded():
                 return

@@ -12,6 +12,8 @@ from typing import Any
 
 import viser
 
+from dt_viz.ui import patches
+
 
 class Control:
     """An input of the panel.
@@ -59,10 +61,7 @@ class Control:
         self._act(value)
 
     def _put_back(self) -> None:
-        # not by viser's setter, which casts to the type of the claim, and calls back on a loop that may have ended
-        self.handle._impl.value = self._value
-        if not _is_button(self.handle):
-            self.handle._queue_update("value", self._value)
+        patches.put_back(self.handle, self._value, shown=not _is_button(self.handle))
 
 
 def switch(checkbox: Control) -> None:

@@ -1,18 +1,16 @@
-"""Gate of the server: checks connections and messages; the only module that relies on viser's internals.
+"""Gate of the server: checks connections and messages before viser sees them.
 
 viser answers every client, handles every message that it can decode, and has no limits. It starts a server of the
 package websockets; the gate is inserted there, so that it sees each request before viser answers it and each message
 before viser decodes it:
 
 - Requests must be meant for this server, and connections come from its own or allowed pages; see `Origins`. The number
-  of connections is limited.
+  of connections is limited. Answers say what the page may load and who may embed it.
 - Messages of the kinds that this page uses are passed on, if they are exactly as viser declares them. Other kinds are
   dropped: some would be stored and sent to everybody (a form that changes), and some request what no visitor may decide
   (a tunnel to the internet). A malformed message ends its connection.
 - The size of files is checked before they are stored; see `Upload`.
-- Failures are logged at a limited rate and without the received content; see `Terse`.
-
-The undocumented parts of viser that are used are checked when the server starts.
+- Failures are logged at a limited rate and without the received content; see `RateLimitFilter`.
 """
 
 from __future__ import annotations
@@ -22,54 +20,44 @@ import dataclasses
 import logging
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import partial
 from http import HTTPStatus
 from typing import Any, get_type_hints
 
 import msgspec
 import viser
-import viser._messages
-import viser._scene_api
-import viser._viser
-import websockets.asyncio.server
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
-from dt_viz.errors import DataError
-from dt_viz.ui import ruler
+from dt_viz.errors import DataError, naming
+from dt_viz.files.checks import check_size
+from dt_viz.ui import patches, ruler
 from dt_viz.ui.origins import Origins
-from dt_viz.ui.uploads import MalformedError, Upload
 
 logger = logging.getLogger(__name__)
 
-SMALL, PART, IMAGE = 64 * 1024, 2**20, 16 * 2**20
-"""Largest sizes of messages, bytes: of most kinds, with a part of a file, and with a rendered image."""
-MAX_SIZES: Mapping[str, int] = {
-    "ViewerCameraMessage": SMALL,
-    "GuiUpdateMessage": SMALL,
-    "CommandTriggerMessage": SMALL,
-    "TransformControlsDragStartMessage": SMALL,
-    "TransformControlsUpdateMessage": SMALL,
-    "TransformControlsDragEndMessage": SMALL,
-    "SceneNodeClickMessage": SMALL,
-    "SceneNodeDragMessage": SMALL,
-    "ScenePointerMessage": SMALL,
-    "GetRenderResponseMessage": IMAGE,
-    "FileTransferStartUpload": SMALL,
-    "FileTransferPart": PART,
-}
-"""Largest sizes, bytes, of the messages that this page uses, by viser's name."""
-MAX_RATE = 400
-"""Largest rate of messages of a connection, 1/s, beyond which they wait; a page sends at most 20 of a kind."""
-MAX_SOCKETS = 256
-"""Largest number of open sockets, with or without a request."""
 MISDIRECTED = (
     "This server is not known by that name. To use it, start it with --allow-origin and the address of the page."
 )
 FOREIGN = "Pages of other servers may not connect. To let one, start this server with --allow-origin and its address."
 FULL = "All places are taken, and those to wait, too."
+KINDS: Mapping[str, str] = {
+    "ViewerCameraMessage": "message",
+    "GuiUpdateMessage": "message",
+    "CommandTriggerMessage": "message",
+    "TransformControlsDragStartMessage": "message",
+    "TransformControlsUpdateMessage": "message",
+    "TransformControlsDragEndMessage": "message",
+    "SceneNodeClickMessage": "message",
+    "SceneNodeDragMessage": "message",
+    "ScenePointerMessage": "message",
+    "GetRenderResponseMessage": "image",
+    "FileTransferStartUpload": "message",
+    "FileTransferPart": "part",
+}
+"""Messages that this page uses, by viser's name, and which of the `Limits` of size each has."""
 
 Answer = Callable[[ServerConnection, Request], Response | None]
 """Callback that answers a request, or returns None to let it become a connection."""
@@ -77,11 +65,81 @@ Refused = Callable[[viser.ClientHandle, str], None]
 """Callback that tells a visitor why a file is not accepted."""
 
 
-class GateError(RuntimeError):
-    """A version of viser whose internals differ from what the gate relies on."""
+@dataclass(frozen=True)
+class Limits:
+    """Limits of what a server takes from its visitors."""
 
-    def __init__(self, what: str) -> None:
-        super().__init__(f"viser {viser.__version__} has changed ({what}); accepted: viser 1.1")
+    connections: int
+    """Largest number of simultaneous connections."""
+    upload: int
+    """Largest size of a file, bytes."""
+    sockets: int = 256
+    """Largest number of open sockets, with or without a request."""
+    rate: float = 400.0
+    """Largest rate of messages of a connection, 1/s, beyond which they wait; a page sends at most 20 of a kind."""
+    message: int = 64 * 1024
+    """Largest size of most messages, bytes."""
+    part: int = 2**20
+    """Largest size of a message with a part of a file, bytes; the page sends half of it."""
+    image: int = 16 * 2**20
+    """Largest size of a message with a rendered image, bytes, and so of any."""
+
+
+class MalformedError(ValueError):
+    """A message that the page never sends."""
+
+
+@dataclass
+class Upload:
+    """The file that one visitor is sending, counted before any of it is held: one at a time."""
+
+    max_bytes: int
+    """Largest size that may be announced, bytes."""
+    max_parts: int = 1024
+    uuid: str = ""
+    """Name of the transfer under way; none if empty."""
+    num_bytes: int = 0
+    """Announced size, bytes."""
+    num_parts: int = 0
+    """Announced number of parts."""
+    num_arrived: int = 0
+    """Size of what has arrived, bytes."""
+    arrived: set[int] = field(default_factory=set)
+    """Numbers of the parts that have arrived."""
+
+    def start(self, uuid: str, name: str, num_bytes: int, num_parts: int) -> None:
+        """Begin a file that is announced; an incomplete one before it has been given up.
+
+        Raises:
+            DataError: it is too large; the message is for the user.
+            MalformedError: no file of that size has so many parts.
+        """
+        self.uuid = ""
+        with naming(DataError, name):
+            check_size(num_bytes, self.max_bytes)
+        if num_bytes < 0 or not min(num_bytes, 1) <= num_parts <= min(num_bytes, self.max_parts):
+            raise MalformedError(f"{num_parts} parts for {num_bytes} bytes")
+        self.uuid = uuid if num_parts else ""
+        self.num_bytes, self.num_parts, self.num_arrived, self.arrived = num_bytes, num_parts, 0, set()
+
+    def part(self, uuid: str, index: int, num_bytes: int) -> bool:
+        """Count a part that arrives; return whether it belongs to the announced file.
+
+        Raises:
+            MalformedError: it has arrived before, or the parts do not add up to the announced size.
+        """
+        if not self.uuid or self.uuid != uuid:
+            return False
+        if index in self.arrived or not 0 <= index < self.num_parts:
+            raise MalformedError(f"part {index} of {self.num_parts}")
+        self.arrived.add(index)
+        self.num_arrived += num_bytes
+        complete = len(self.arrived) == self.num_parts
+        if self.num_arrived > self.num_bytes or (complete and self.num_arrived < self.num_bytes):
+            raise MalformedError(f"{self.num_arrived} bytes of {self.num_bytes}")
+        if complete:
+            self.uuid = ""
+        return True
 
 
 class _Value(msgspec.Struct, forbid_unknown_fields=True):
@@ -99,13 +157,13 @@ class _Connection(ServerConnection):
 
     def __init__(self, gate: Gate, *arguments: Any, **options: Any) -> None:  # noqa: ANN401 - of websockets
         super().__init__(*arguments, **options)
-        self.upload = Upload(gate.max_upload)
+        self.upload = Upload(gate.limits.upload)
         self._gate = gate
         self._second, self._num_received = 0.0, 0
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
-        if len(self.server.handlers) > MAX_SOCKETS:
+        if len(self.server.handlers) > self._gate.limits.sockets:
             self.transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -129,7 +187,7 @@ class _Connection(ServerConnection):
         if now - self._second >= 1:
             self._second, self._num_received = now, 0
         self._num_received += 1
-        if self._num_received > MAX_RATE:
+        if self._num_received > self._gate.limits.rate:
             await asyncio.sleep(self._second + 1 - now)
 
 
@@ -139,9 +197,7 @@ class Gate:
     def __init__(
         self,
         origins: Origins,
-        *,
-        max_connections: int,
-        max_upload: int,
+        limits: Limits,
         refused: Refused,
         measured: ruler.Measured = lambda _token, _width: None,
     ) -> None:
@@ -149,24 +205,22 @@ class Gate:
 
         Args:
             origins: pages that may connect.
-            max_connections: largest number of simultaneous connections.
-            max_upload: largest size of a file, bytes.
+            limits: limits of what visitors send.
             refused: called with a visitor and the reason when a file is not accepted.
             measured: called with what a `Ruler` measures. It must only take note.
 
         Raises:
             GateError: viser's messages differ from the expected ones.
         """
-        self.max_upload = max_upload
-        self._origins, self._max_connections, self._refused = origins, max_connections, refused
-        self._measured = measured
+        self.limits = limits
+        self._origins, self._refused, self._measured = origins, refused, measured
         self._connections: set[ServerConnection] = set()
         self._server: viser.ViserServer | None = None
         self._protocol = f"viser-v{viser.__version__}"
         try:
-            self._decoders = {name: msgspec.msgpack.Decoder(_strict(name)) for name in MAX_SIZES}
+            self._decoders = {name: msgspec.msgpack.Decoder(_strict(name)) for name in KINDS}
         except (AttributeError, TypeError) as error:
-            raise GateError(str(error)) from error
+            raise patches.GateError(str(error)) from error
 
     def open(self, host: str, port: int, label: str) -> viser.ViserServer:
         """Start viser's server behind the gate; the arguments are those of `viser.ViserServer`.
@@ -174,38 +228,19 @@ class Gate:
         Raises:
             GateError: viser does not start its server as expected.
         """
-        _report_to_the_log()
-        with self._put_into_websockets() as used:
-            server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
-        connections = getattr(getattr(server, "_websock_server", None), "_live_connections", None)
-        if not used or not isinstance(connections, dict):
-            server.stop()
-            raise GateError("its server" if not used else "its connections")
-        self._server = server
-        return server
+        patches.report_failures(lambda error: logger.error("a callback failed", exc_info=error))
+        self._server = patches.open_server(self._guarded, host=host, port=port, label=label, verbose=False)
+        return self._server
 
-    @contextmanager
-    def _put_into_websockets(self) -> Iterator[list[bool]]:
-        """Make servers of websockets start with this gate; the yielded list is not empty once one did."""
-        module: Any = websockets.asyncio.server
-        original = module.serve
-        used: list[bool] = []
-
-        def serve(handler: Any, *arguments: Any, process_request: Answer, **options: Any) -> Any:  # noqa: ANN401
-            used.append(True)
-            asyncio.get_running_loop().set_exception_handler(_report_loop)
-            options |= {
-                "process_request": partial(self._answer, process_request),
-                "create_connection": partial(_Connection, self),
-                "max_size": IMAGE,
-            }
-            return original(partial(self._handle, handler), *arguments, **options)
-
-        module.serve = serve
-        try:
-            yield used
-        finally:
-            module.serve = original
+    def _guarded(self, handler: Any, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:  # noqa: ANN401
+        """Put the gate between websockets and viser's handler of connections."""
+        asyncio.get_running_loop().set_exception_handler(_report_loop)
+        return partial(self._handle, handler), {
+            **options,
+            "process_request": partial(self._answer, options["process_request"]),
+            "create_connection": partial(_Connection, self),
+            "max_size": self.limits.image,
+        }
 
     def _answer(self, answer: Answer, connection: ServerConnection, request: Request) -> Response | None:
         hosts = request.headers.get_all("Host")
@@ -217,7 +252,7 @@ class Gate:
             if len(origins) > 1 or (origins and not self._origins.admits(origins[0], hosts[0])):
                 logger.warning("a page of another server was refused; --allow-origin lets it connect")
                 return connection.respond(HTTPStatus.FORBIDDEN, FOREIGN)
-            if len(self._connections) >= self._max_connections:
+            if len(self._connections) >= self.limits.connections:
                 logger.warning("a connection was refused: there are %d", len(self._connections))
                 return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, FULL)
             self._connections.add(connection)
@@ -226,7 +261,12 @@ class Gate:
             response = connection.respond(HTTPStatus.NO_CONTENT, "")
             response.headers["Cache-Control"] = "no-store"  # so that it is asked for each time
             return response
-        return answer(connection, request)
+        response = answer(connection, request)
+        if response is not None:
+            response.headers["Content-Security-Policy"] = self._origins.policy
+            response.headers["X-Content-Type-Options"] = "nosniff"
+            response.headers["Referrer-Policy"] = "no-referrer"
+        return response
 
     async def _handle(self, handler: Callable[[ServerConnection], Any], connection: ServerConnection) -> None:
         if connection.subprotocol == self._protocol:
@@ -248,9 +288,9 @@ class Gate:
             raise MalformedError("text")
         try:
             name = msgspec.msgpack.decode(raw, type=_Kind).type
-            if name not in MAX_SIZES:
+            if name not in KINDS:
                 return False
-            if len(raw) > MAX_SIZES[name]:
+            if len(raw) > getattr(self.limits, KINDS[name]):
                 raise MalformedError(f"{len(raw)} bytes")
             message: Any = self._decoders[name].decode(raw)
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
@@ -263,45 +303,34 @@ class Gate:
 
     def _begins(self, connection: _Connection, message: Any) -> bool:  # noqa: ANN401 - FileTransferStartUpload
         """Return whether a file is accepted; tell the visitor if not."""
-        client = self._client_of(connection)
+        client = None if self._server is None else patches.client_of(self._server, connection)
         if client is None:
             return False  # there is no page yet that could send it
-        client.gui._drop_uploads_from_client(client._websock_connection.client_id)  # pyright: ignore[reportArgumentType]
+        patches.drop_uploads(client)
         try:
             connection.upload.start(message.transfer_uuid, message.filename, message.size_bytes, message.part_count)
         except DataError as error:
-            # the page shows an upload in progress until all of it is acknowledged
-            for told in (
-                viser._messages.FileTransferPartAck(
-                    message.source_component_uuid, message.transfer_uuid, message.size_bytes, message.size_bytes
-                ),
-                viser._messages.RemoveNotificationMessage(f"upload-{message.transfer_uuid}"),
-            ):
-                client._websock_connection.queue_message(told)
+            patches.refuse_upload(client, message)
             self._refused(client, str(error))
             return False
         return True
 
-    def _client_of(self, connection: ServerConnection) -> viser.ClientHandle | None:
-        """Return the client of a connection; None before its page has reported a camera."""
-        if self._server is None:
-            return None
-        live = self._server._websock_server._live_connections
-        ids = [client_id for client_id, other in live.items() if other is connection]
-        return self._server.get_clients().get(ids[0]) if ids else None
-
 
 def _strict(name: str) -> type[msgspec.Struct]:
     """Return the strict type of one of viser's messages: all declared fields, of their types, and no others."""
-    declared = getattr(viser._messages, name)
+    declared = patches.declared(name)
     hints = get_type_hints(declared)
     if name == "GuiUpdateMessage":
         hints["updates"] = _Value
     fields = [
-        (field.name, hints[field.name], *(() if field.default is dataclasses.MISSING else (field.default,)))
-        for field in dataclasses.fields(declared)
+        (one.name, hints[one.name], *(() if one.default is dataclasses.MISSING else (one.default,)))
+        for one in dataclasses.fields(declared)
     ]
     return msgspec.defstruct(name, fields, tag_field="type", tag=name, forbid_unknown_fields=True)
+
+
+def _report_loop(_loop: asyncio.AbstractEventLoop, context: Mapping[str, Any]) -> None:
+    logger.error("on the event loop: %s", context.get("message"), exc_info=context.get("exception"))
 
 
 def _is_finite(value: Any) -> bool:  # noqa: ANN401 - a message, or what it holds
@@ -311,29 +340,3 @@ def _is_finite(value: Any) -> bool:  # noqa: ANN401 - a message, or what it hold
     if isinstance(value, tuple):
         return all(_is_finite(item) for item in value)
     return not isinstance(value, float) or math.isfinite(value)
-
-
-def _report_to_the_log() -> None:
-    """Make viser log what its callbacks raise, which it would print, however often."""
-    reports = {
-        "print_threadpool_errors": _report_task,
-        "print_task_error": _report_task,
-        "print_awaited_callback_error": _report,
-    }
-    for module in (viser._gui_api, viser._scene_api, viser._viser):
-        for name, report in reports.items():
-            if hasattr(module, name):
-                setattr(module, name, report)
-
-
-def _report(error: BaseException) -> None:
-    logger.error("a callback failed", exc_info=error)
-
-
-def _report_task(task: Any) -> None:  # noqa: ANN401 - a future, or a task
-    if not task.cancelled() and task.exception() is not None:
-        _report(task.exception())
-
-
-def _report_loop(_loop: asyncio.AbstractEventLoop, context: Mapping[str, Any]) -> None:
-    logger.error("on the event loop: %s", context.get("message"), exc_info=context.get("exception"))

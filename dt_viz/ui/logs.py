@@ -8,52 +8,37 @@ import time
 import traceback
 from collections.abc import Callable
 
-MAX_RECORDS = 5
-"""Largest number of records of one kind in a `PERIOD`."""
-PERIOD = 60.0
-"""Time after which records of a kind are logged again, seconds."""
 
-_Kind = tuple[str, int, str | None]
-
-
-class Terse(logging.Filter):
+class RateLimitFilter(logging.Filter):
     """Filter that passes a few records of each kind, with the type and traceback of exceptions but not their text.
 
-    A kind is a place in the program, so their number is limited. The first record after a `PERIOD` says how many were
+    A kind is a place in the program, so their number is limited. The first record after a period says how many were
     left out.
     """
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        """Count by a clock, seconds."""
+    def __init__(self, max_records: int = 5, period: float = 60.0, clock: Callable[[], float] = time.monotonic) -> None:
+        """Pass at most `max_records` of a kind in a `period`, seconds, of a clock."""
         super().__init__()
-        self._clock = clock
+        self._max_records, self._period, self._clock = max_records, period, clock
         self._lock = threading.Lock()
-        self._counts: dict[_Kind, tuple[float, int]] = {}
+        self._counts: dict[tuple[str, int, str], tuple[float, int]] = {}
         """Start of the current period, and number of records since, by kind."""
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Return whether to write the record, after removing its confidential parts."""
-        place = None
+        place, left_out = "", 0
         if record.exc_info and record.exc_info[0] is not None:
-            kind, _, trace = record.exc_info
+            error, _, trace = record.exc_info
             frames = traceback.extract_tb(trace)
-            place = f"{kind.__name__}" + (f" {frames[-1].filename}:{frames[-1].lineno}" if frames else "")
-            record.exc_text = "".join(traceback.format_list(frames)) + kind.__name__
+            place = error.__name__ + (f" {frames[-1].filename}:{frames[-1].lineno}" if frames else "")
+            record.exc_text = "".join(traceback.format_list(frames)) + error.__name__
             record.exc_info = None
-        left_out = self._num_left_out((record.pathname, record.lineno, place))
-        if left_out is None:
-            return False
-        if left_out:
-            record.msg, record.args = f"{record.getMessage()} (and {left_out} more like this)", ()
-        return True
-
-    def _num_left_out(self, kind: _Kind) -> int | None:
-        """Return how many of its kind were left out in the last period; None if this one is left out, too."""
-        now = self._clock()
+        kind, now = (record.pathname, record.lineno, place), self._clock()
         with self._lock:
             began, count = self._counts.get(kind, (now, 0))
-            left_out = 0
-            if now - began >= PERIOD:
-                began, count, left_out = now, 0, max(0, count - MAX_RECORDS)
+            if now - began >= self._period:
+                began, count, left_out = now, 0, max(0, count - self._max_records)
             self._counts[kind] = began, count + 1
-        return left_out if count < MAX_RECORDS else None
+        if left_out:
+            record.msg, record.args = f"{record.getMessage()} (and {left_out} more like this)", ()
+        return count < self._max_records

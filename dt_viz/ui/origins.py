@@ -56,6 +56,9 @@ class Origin:
         assert parts.hostname is not None
         return cls(parts.scheme, parts.hostname, parts.port or DEFAULT_PORTS[parts.scheme])
 
+    def __str__(self) -> str:
+        return f"{self.scheme}://{f'[{self.host}]' if ':' in self.host else self.host}:{self.port}"
+
 
 class Origins:
     """Rules for the requests and pages that are accepted."""
@@ -69,6 +72,13 @@ class Origins:
         """
         self._allowed = frozenset(allowed)
         self._names = {LOOPBACK, host.lower(), *(origin.host for origin in self._allowed)}
+        embedders = " ".join(["'self'", *sorted(map(str, self._allowed))])
+        self.policy = (
+            "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; connect-src 'self' ws: wss: data: blob:; "
+            f"object-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors {embedders}"
+        )
+        """Content policy of the page, as a header: it loads nothing from elsewhere, and only allowed pages embed it.
+        viser's page is one file, which unpacks and evaluates its script."""
 
     def knows(self, host: str) -> bool:
         """Return whether a request to this host, the value of the header ``Host``, is meant for this server."""

@@ -11,12 +11,14 @@ from __future__ import annotations
 import re
 import secrets
 from collections.abc import Callable
+from itertools import accumulate
 from math import ceil
 
+FOLDER = "window"
 STEP = 1.04
 """Ratio of a width to the next smaller one that is told apart."""
-NARROWEST, WIDEST = 240, 8000
-"""Smallest and largest width that is told apart, CSS pixels."""
+WIDTHS = tuple(accumulate(range(89), lambda width, _: ceil(STEP * width), initial=240))
+"""Widths from which on another picture is asked for, CSS pixels, ascending."""
 Measured = Callable[[str, float], None]
 """Callback that takes the token of a ruler, and what its window is at least wide, CSS pixels."""
 
@@ -31,24 +33,12 @@ class Ruler:
     @property
     def html(self) -> str:
         """The picture, which is not to be seen."""
-        address = f"{_FOLDER}/{self.token}"
+        address = f"{FOLDER}/{self.token}"
         sources = [f'<source media="(min-width: {width}px)" srcset="{address}/{width}">' for width in reversed(WIDTHS)]
         return f'<picture hidden>{"".join(sources)}<img src="{address}/{WIDTHS[0]}" alt=""></picture>'
 
 
 def told(path: str) -> tuple[str, float] | None:
     """Return the token and the width, CSS pixels, that the path of a request tells; None if it is another request."""
-    found = re.search(rf"/{_FOLDER}/([\w-]+)/(\d{{1,5}})$", path, re.ASCII)
+    found = re.search(rf"/{FOLDER}/([\w-]+)/(\d{{1,5}})$", path, re.ASCII)
     return (found[1], float(found[2])) if found is not None and int(found[2]) in WIDTHS else None
-
-
-def _widths() -> list[int]:
-    widths = [NARROWEST]
-    while widths[-1] < WIDEST:
-        widths.append(ceil(STEP * widths[-1]))
-    return widths
-
-
-_FOLDER = "window"
-WIDTHS = _widths()
-"""Widths from which on another picture is asked for, CSS pixels, ascending."""

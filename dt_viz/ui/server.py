@@ -7,7 +7,7 @@ import socket
 import threading
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NoReturn
 
 import viser
@@ -18,20 +18,14 @@ from dt_viz.obstacles.files import MAX_BYTES
 from dt_viz.robot.robot import load_jaco
 from dt_viz.scenario.tasks import TaskEntry
 from dt_viz.session.engine import Engine
-from dt_viz.ui.gate import Gate
+from dt_viz.ui.gate import Gate, Limits
 from dt_viz.ui.origins import Origin, Origins
-from dt_viz.ui.visitor import NOTICE_SECONDS, Visitor
+from dt_viz.ui.tabs.status import COLOURS
+from dt_viz.ui.visitor import Visitor, notify
+from dt_viz.warning import Severity
 
 logger = logging.getLogger(__name__)
 
-MAX_WAITING = 8
-"""Number of connections beyond the visitors that wait for a place; any more are refused."""
-
-MAX_SLEEP = 0.5
-"""Longest sleep of the main thread, seconds. Only this thread runs signal handlers, and a signal that arrives just
-before a sleep, or on another thread, is handled after it."""
-CLOSING = 2.0
-"""Longest wait for pages that are being built or drawn while the server closes, seconds."""
 
 # a visitor may leave between two pictures of the arm; a picture without a receiver is no problem
 warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
@@ -53,6 +47,7 @@ class Server:
         host: str = "127.0.0.1",
         port: int = 8080,
         max_sessions: int = 8,
+        max_waiting: int = 8,
         allowed: Sequence[Origin] = (),
     ) -> None:
         """Listen and wait for visitors.
@@ -64,6 +59,7 @@ class Server:
             host: address to listen on.
             port: port to listen on; 0 takes any free one.
             max_sessions: largest number of visitors; further ones wait until one leaves.
+            max_waiting: largest number of those who wait; any more are refused.
             allowed: origins of other pages that may connect; see `Origins`.
 
         Raises:
@@ -71,10 +67,11 @@ class Server:
             GateError: this version of viser is not supported.
         """
         port = _checked_port(host, port)
-        self._tasks, self._fits, self._task = tasks, fits, task
-        self._titles = {name: entry.title for name, entry in tasks.items()}
+        robot, titles, shared = load_jaco(), {name: entry.title for name, entry in tasks.items()}, Memo()
+        self._new_visitor: Callable[[viser.ClientHandle], Visitor] = lambda client: Visitor(
+            client, Engine(tasks, fits, robot, shared), robot, titles, task
+        )
         self._max_sessions = max_sessions
-        self._robot, self._shared = load_jaco(), Memo()
         self._lock = threading.Condition()
         self._visitors: dict[int, Visitor | None] = {}
         """Those with a page, and None for those whose page is being built."""
@@ -83,14 +80,10 @@ class Server:
         self._num_building = 0
         """Number of pages that are being built, also for visitors who have left meanwhile."""
         self._closed = False
-        gate = Gate(
-            Origins(host, allowed),
-            max_connections=max_sessions + MAX_WAITING,
-            max_upload=MAX_BYTES,
-            refused=_refuse,
-            measured=self._measured,
+        self.gate = Gate(
+            Origins(host, allowed), Limits(max_sessions + max_waiting, upload=MAX_BYTES), _refuse, self._measured
         )
-        self._server = gate.open(host, port, "DT-Viz")
+        self._server = self.gate.open(host, port, "DT-Viz")
         if self._server.get_port() != port:  # another program was faster than the check
             self._server.stop()
             raise AddressError(f"port {port} on {host} was taken a moment ago; choose another with --port")
@@ -104,35 +97,37 @@ class Server:
         """Visitors with a page of their own."""
         return tuple(visitor for visitor in self._visitors.values() if visitor is not None)
 
-    @property
-    def _full(self) -> str:
-        return (
-            f"**All {self._max_sessions} places are taken.** This page opens by itself when a place is free: close "
-            "another tab of this demo, or wait. Whoever runs the server can allow more with `--max-sessions`."
-        )
-
     def wait(self) -> NoReturn:
-        """Serve until a signal handler raises an exception."""
+        """Serve until a signal handler raises an exception.
+
+        Only this thread runs signal handlers, and a signal that arrives just before a sleep, or on another thread, is
+        handled after it.
+        """
         while True:
-            time.sleep(MAX_SLEEP)
+            time.sleep(0.5)
 
     def close(self) -> None:
         """Close all pages and stop listening."""
+        patience = 2.0  # seconds
         with self._lock:
             self._closed = True
-            self._lock.wait_for(lambda: not self._num_building, CLOSING)  # a page that is being built needs the server
+            self._lock.wait_for(lambda: not self._num_building, patience)  # a page that is being built needs the server
         visitors = self.visitors
         for visitor in visitors:
             visitor.close()
         for visitor in visitors:  # and so does what they are drawing
-            visitor.session.wait_idle(CLOSING)
+            visitor.session.jobs.wait_idle(timeout=patience)
         self._server.stop()
 
     def _welcome(self, client: viser.ClientHandle) -> None:
         with self._lock:
             if self._closed or client.client_id not in self._server.get_clients():
                 return  # left before its turn came
-            said = client.gui.add_markdown(self._full) if len(self._visitors) >= self._max_sessions else None
+            full = (
+                f"**All {self._max_sessions} places are taken.** This page opens by itself when a place is free: close "
+                "another tab of this demo, or wait. Whoever runs the server can allow more with `--max-sessions`."
+            )
+            said = client.gui.add_markdown(full) if len(self._visitors) >= self._max_sessions else None
             self._waiting[client.client_id] = client, said
         self._admit()
 
@@ -154,9 +149,8 @@ class Server:
                 self._lock.notify_all()
 
     def _build_page(self, client: viser.ClientHandle) -> None:
-        engine = Engine(self._tasks, self._fits, self._robot, self._shared)
         try:
-            visitor = Visitor(client, engine, self._robot, self._titles, self._task)
+            visitor = self._new_visitor(client)
         except Exception as error:
             logger.exception("the page of visitor %d could not be built", client.client_id)
             client.gui.add_markdown(f"**The page could not be built.** {type(error).__name__}: {error}")
@@ -184,7 +178,7 @@ class Server:
 
 
 def _refuse(client: viser.ClientHandle, text: str) -> None:
-    client.add_notification("DT-Viz", text, color="red", auto_close_seconds=NOTICE_SECONDS)
+    notify(client, text, COLOURS[Severity.ALARM][0])
 
 
 def _checked_port(host: str, port: int) -> int:

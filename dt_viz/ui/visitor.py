@@ -6,9 +6,11 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
+from functools import partial
 
 import viser
 
+from dt_viz.files.uploads import keep_ready, let_go
 from dt_viz.flows.fields import Array
 from dt_viz.obstacles.shapes import Sphere, as_point, as_quaternion
 from dt_viz.robot.robot import Robot
@@ -18,8 +20,10 @@ from dt_viz.scenario.stack import selected, transform_of, with_avoidance, with_t
 from dt_viz.scenario.starts import followed, with_moved_start, with_start
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Frame, Stage
-from dt_viz.session.session import Display, Pace, Session
-from dt_viz.ui.panel.panel import ControlPanel
+from dt_viz.session.progress import Display, Pace, Progress
+from dt_viz.session.session import Session
+from dt_viz.ui.controls import on_press
+from dt_viz.ui.panel import ControlPanel
 from dt_viz.ui.playback import Playback
 from dt_viz.ui.ruler import Ruler
 from dt_viz.ui.scene import palette
@@ -39,15 +43,17 @@ from dt_viz.ui.scene.starts import Starts
 from dt_viz.ui.scene.tripod import Tripod
 from dt_viz.ui.scene.way import WayAhead
 
-NOTICE_SECONDS = 12.0
-"""Time after which a notification closes by itself, seconds."""
-
 
 def initial_scenario(engine: Engine, task: str) -> Scenario:
     """Return the scenario that a task begins with. Raises what `Engine.task` raises."""
     scenario = Scenario(task)
     sphere = Sphere(engine.task(task).obstacle_position)
     return replace(scenario, stack=with_avoidance(scenario, obstacles=(sphere,)))
+
+
+def notify(client: viser.ClientHandle, text: str, colour: Colour) -> None:
+    """Show a text in a colour beside the panel of a visitor for a while."""
+    client.add_notification("DT-Viz", text, color=colour, auto_close_seconds=12.0)
 
 
 class Visitor(Display):
@@ -91,16 +97,19 @@ class Visitor(Display):
         self._robot = robot
         self._posed: tuple[bytes, bool] | None = None
         """The posture that was drawn last, and whether with that without avoidance."""
-        self.playback = Playback(engine.arm, self._pose, self.fail)
+        self.playback = Playback(engine.arm, self._pose)
         """What moves the arm."""
         self._tripod = Tripod(client, self._hand)
-        self._panel = ControlPanel(client.gui, titles, robot, self._save_png, self._notify, self._tripod, self._darken)
+        self._panel = ControlPanel(
+            client.gui, titles, robot, self._save_png, partial(notify, client), self._tripod, self._darken
+        )
         self.session = Session(engine, lambda name: initial_scenario(engine, name), task, self)
         self._panel.connect(self.session)
-        self._panel.push.connect(engine.arm.push)
+        on_press(self._panel.push, engine.arm.push)
         self.ruler = Ruler()
         """What the visitor's window is measured with."""
-        self.playback.begin()
+        self.playback.begin(self.session.jobs, self.session.fail)
+        keep_ready(self)
 
     @property
     def arm(self) -> ArmPicture:
@@ -131,7 +140,7 @@ class Visitor(Display):
         if frame.stage is not Stage.ROLLOUTS:
             self.playback.replay.motion = frame.arm
             self.grip.draw(frame, live=not self._view.replay)
-            self._panel.report(frame, pace)
+            self._panel.report(frame)
         self.client.flush()
         self.shown = frame
 
@@ -152,20 +161,13 @@ class Visitor(Display):
         self.playback.play(view.playing, view.speed, replays=view.replay)
         self._panel.adopt(scenario)
 
-    def learning(self, fraction: float, message: str) -> None:
-        self._panel.learning(fraction, message)
-
-    def fail(self, error: Exception) -> None:
-        self._panel.fail(error)
-
-    def cancelled(self, task: str) -> None:
-        self._panel.cancelled(task)
+    def tell(self, progress: Progress) -> None:
+        self._panel.tell(progress)
 
     def close(self) -> None:
-        """Stop all threads: the visitor has left."""
-        self._panel.close()
+        """Stop all work: the visitor has left."""
+        let_go(self)
         self.session.close()
-        self.playback.close()
 
     @contextmanager
     def _dragging(self, phase: str) -> Iterator[Scenario]:
@@ -285,9 +287,6 @@ class Visitor(Display):
         finally:
             if self._dark:
                 self._dye(True)
-
-    def _notify(self, text: str, colour: Colour) -> None:
-        self.client.add_notification("DT-Viz", text, color=colour, auto_close_seconds=NOTICE_SECONDS)
 
     def _save_png(self, resolution: str, transparent: bool) -> None:
         with self.pictures.without_handles(), self.grip.without_handles(), self._light():

@@ -12,7 +12,7 @@ from twirl import shown_in_the_readme
 from dt_viz.avoidance import registry
 from dt_viz.scenario.stack import anchored, listed, shifted, surroundings, switched, tunable, with_added
 from dt_viz.session.frame import Stage
-from dt_viz.ui.panel.transforms import add, add_transform_controls, addable
+from dt_viz.ui.tabs.world import add_transform, add_transforms, addable
 
 
 @pytest.fixture(params=[("Twirl 1", "Avoidance"), ("Avoidance", "Twirl 1")], ids=" below ".join)
@@ -61,9 +61,9 @@ def test_the_page_offers_it_and_has_its_controls(server, monkeypatch):
     monkeypatch.setattr(registry, "KINDS", (*registry.KINDS, shown_in_the_readme()))
     bound = Bound(avoiding("lift_box"))
     session: Any = bound.edited
-    add_transform_controls(server.gui, bound, later=lambda work: work())
+    add_transforms(server.gui, bound)
     assert list(addable()) == ["Bias", "Twirl"]
-    add(session, addable()["Twirl"])
+    add_transform(session, addable()["Twirl"])
     assert bound["Angle [rad]"].control.value == 0.8
     bound.set("Angle [rad]", -0.5)
     assert [layer.name for layer in session.scenario.stack] == ["Twirl 1", "Avoidance"]

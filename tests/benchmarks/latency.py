@@ -51,7 +51,8 @@ from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import anchored, plane_of, with_added, with_avoidance, with_transform
 from dt_viz.scenario.tasks import Task
 from dt_viz.session.frame import Frame, Stage
-from dt_viz.session.session import Display, Pace, Session
+from dt_viz.session.progress import Display, Pace, Progress
+from dt_viz.session.session import Session
 
 EDITS_PER_SECOND = 60
 WARM_UP_SECONDS = 1.0
@@ -80,14 +81,15 @@ class Recorder(Display):
     """Stage, seconds from the edit until the frame was ready, and seconds of computing alone, of each frame."""
     num_skipped: int = 0
     """Number of skipped edits since the session began."""
-    error: Exception | None = None
+    error: str = ""
 
     def draw(self, frame: Frame, pace: Pace) -> None:
         self.frames.append((frame.stage, pace.latency, frame.seconds))
         self.num_skipped = pace.num_skipped
 
-    def fail(self, error: Exception) -> None:
-        self.error = error
+    def tell(self, progress: Progress) -> None:
+        if progress.failed and progress.message is not None:
+            self.error = progress.message.text
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -121,7 +123,7 @@ def run(options: argparse.Namespace) -> int:
         _settle(session)
     finally:
         session.close()
-    if shown.error is not None:
+    if shown.error:
         print(f"the session failed: {shown.error}", file=sys.stderr)
         return 1
     first, live = (np.array([f[1:] for f in shown.frames if f[0] is stage]) for stage in (Stage.ROLLOUTS, Stage.LIVE))

@@ -23,8 +23,8 @@ from browsing import (
 from chromium import needs_chromium
 
 from dt_viz.scenario.tasks import TASKS
-from dt_viz.ui.panel.compare import TITLES
 from dt_viz.ui.server import Server
+from dt_viz.ui.tabs.compare import TITLES
 
 SIZE = (1280, 720)
 pytestmark = [pytest.mark.browser, pytest.mark.slow, needs_chromium]

@@ -23,9 +23,9 @@ from browsing import (
 from chromium import needs_chromium
 
 from dt_viz.scenario.tasks import TASKS
-from dt_viz.ui.panel.big_type import LARGER
 from dt_viz.ui.ruler import STEP
 from dt_viz.ui.scene.camera import camera_for
+from dt_viz.ui.tabs.picture import LARGER
 
 PHONE, PROJECTOR, LAPTOP, PHONE_ON_ITS_SIDE = (390, 844), (1920, 1080), (1280, 720), (844, 390)
 

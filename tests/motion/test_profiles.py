@@ -20,7 +20,7 @@ from dt_viz.motion.profiles import NUM_SAMPLES
 from dt_viz.robot.body_points import load_body_points
 from dt_viz.scenario.scenario import View
 from dt_viz.session.frame import Stage
-from dt_viz.ui.panel.health_plots import HealthPlots
+from dt_viz.ui.tabs.plots import HealthPlots
 
 SHOWN = View(field=False, health_plots=True)
 

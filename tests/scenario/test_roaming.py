@@ -16,7 +16,8 @@ from dt_viz.scenario.roaming import (
     crossings,
 )
 from dt_viz.scenario.tasks import TASKS
-from dt_viz.session.player import Player
+from dt_viz.session import player
+from dt_viz.session.jobs import Jobs
 
 SECONDS = np.arange(0, 60, 0.05)
 
@@ -86,6 +87,7 @@ class Editable:
 
     def __init__(self, scenario):
         self.scenario, self.edits, self.gestures = scenario, 0, []
+        self.jobs = Jobs(lambda error: pytest.fail(str(error)))
 
     def edit(self, _gesture, **changes):
         self.scenario = changed(self.scenario, **changes)
@@ -109,16 +111,15 @@ def wait_until(condition):
 def test_in_the_end_the_world_is_as_it_was_unless_somebody_else_has_changed_it(engine, initial, taken):
     before = initial("draw_s")
     session, told = Editable(before), []
-    player = Player(told.append)
     chase = Chase(engine.task("draw_s"), before, 0.3, np.random.default_rng(0))
-    player.start(cast(Any, session), "Disturb", chase, returns=True)
+    player.start(cast(Any, session), "Disturb", chase, told.append, returns=True)
     wait_until(lambda: session.edits > 5)
     assert session.scenario.obstacles[0].position != before.obstacles[0].position
     mine = changed(before, obstacles=(Sphere((0.0, -0.4, 0.6)),))
     if taken:
         session.scenario = mine
     else:
-        player.stop()
+        player.stop(cast(Any, session))
     wait_until(lambda: told == [True, False])
     assert session.scenario == (mine if taken else before)
     assert session.gestures == (["begin"] if taken else ["begin", "end"])

@@ -25,9 +25,9 @@ from dt_viz.scenario.tasks import TASKS, TaskEntry, drawing_task
 from dt_viz.session.comparison import NEXT, OTHERS, WAITS, curves, scored
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Stage
-from dt_viz.ui.panel.bindings import Bindings
-from dt_viz.ui.panel.compare import ComparePanel, _compare, _with_their_arm, hint, table_html
+from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.scene.comparison import APART, COLOURS, ComparedMotions, TheirArm
+from dt_viz.ui.tabs.compare import ComparePanel, _compare, _with_their_arm, hint, table_html
 
 LIVE, SLOW = "linear", "mpnet"
 

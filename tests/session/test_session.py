@@ -4,6 +4,7 @@ import logging
 import threading
 import time
 from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
@@ -27,6 +28,7 @@ from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Stage
 from dt_viz.session.history import GESTURE_PAUSE, MAX_UNDO
 from dt_viz.session.session import Session
+from dt_viz.warning import Severity
 
 PATIENCE = 30.0
 
@@ -38,6 +40,7 @@ class Sketch:
     scenario: Scenario
     stage: Stage
     passing: Passing = field(default_factory=Passing, compare=False)
+    seconds: float = field(default=0.0, compare=False)
 
 
 class FakeEngine:
@@ -49,6 +52,9 @@ class FakeEngine:
         self.unlearned, self.learning = set(), threading.Event()
         self.seen, self.driven, self.drivers = [], [], set()
         self.endless, self.busy = None, threading.Event()
+
+    def task(self, name):
+        return SimpleNamespace(title=name)
 
     def frames(self, scenario, progress=None, cancelled=never):
         self.asked.append(scenario)
@@ -85,8 +91,9 @@ class Page:
     """A display that remembers."""
 
     def __init__(self):
-        self.frames, self.paces, self.adopted, self.errors = [], [], [], []
-        self.cancellations = []
+        self.frames, self.paces, self.adopted = [], [], []
+        self.errors, self.warnings = [], []
+        self.progress = None
 
     def draw(self, frame, pace):
         self.frames.append(frame)
@@ -95,14 +102,11 @@ class Page:
     def adopt(self, scenario):
         self.adopted.append(scenario)
 
-    def learning(self, fraction, message):
-        pass
-
-    def fail(self, error):
-        self.errors.append(error)
-
-    def cancelled(self, task):
-        self.cancellations.append(task)
+    def tell(self, progress):
+        before, self.progress = self.progress, progress
+        message = progress.message
+        if message is not None and (before is None or message is not before.message):
+            {Severity.ALARM: self.errors, Severity.WARNING: self.warnings}[message.severity].append(message.text)
 
 
 def fresh(task):
@@ -416,11 +420,40 @@ def test_an_error_is_shown_once_and_the_session_goes_on(opened, caplog):
     with caplog.at_level(logging.CRITICAL):
         opened.edit("temperature", temperature=13.0)
         opened.settle()
-    assert [str(error) for error in opened.page.errors] == ["unlucky.csv: file: found 13; accepted: another"]
+    assert opened.page.errors == ["unlucky.csv: file: found 13; accepted: another"]
     opened.edit("temperature", temperature=5.0)
     opened.settle()
     assert opened.shown.avoidance.temperature == 5.0
     assert len(opened.page.errors) == 1
+
+
+def test_a_message_stays_until_another_scenario_is_shown(opened):
+    opened.session.fail(ValueError("it fails"))
+    assert opened.page.progress.failed
+    opened.session.undo()  # nothing to undo
+    assert opened.page.progress.message.text == "ValueError: it fails"
+    opened.edit("temperature", temperature=3.0)
+    opened.settle()
+    progress = opened.page.progress
+    assert progress.message is None and not progress.failed and progress.complete and not progress.stale
+
+
+def test_what_is_shown_is_stale_while_another_task_is_expected_read_or_learned(opened):
+    assert opened.page.progress.complete
+    for expected in (True, False):
+        opened.session.expect(expected)
+        assert opened.page.progress.stale == expected != opened.page.progress.complete
+    opened.engine.gate = threading.Event()
+    opened.session.choose_task("lift_box")
+    assert opened.page.progress.stale
+    opened.engine.gate.set()
+    opened.settle()
+    assert not opened.page.progress.stale
+    begin_learning(opened, "push_box")
+    assert opened.page.progress.stale
+    opened.engine.unlearned = set()
+    opened.settle()
+    assert opened.page.progress.complete and opened.page.progress.learning is None
 
 
 UNDRAWABLE = View(generator=True, generator_layer=-9, health_plots=True)
@@ -430,7 +463,7 @@ def test_a_view_that_cannot_be_drawn_is_left_by_reset(opened, caplog):
     with caplog.at_level(logging.CRITICAL):
         opened.edit("view", view=UNDRAWABLE)
         opened.settle()
-    assert [str(error) for error in opened.page.errors] == ["no such flow"]
+    assert opened.page.errors == ["IndexError: no such flow"]
     opened.session.reset()
     opened.settle()
     assert opened.page.frames[-1] == Sketch(fresh("draw_s"), Stage.CERTIFIED)
@@ -463,8 +496,7 @@ def test_a_session_that_closes_ends_what_it_computes_for_a_hand(opened, stage):
     opened.edit("obstacle", obstacles=(at(2.0),))
     assert not opened.session.wait_idle(0.2)  # a newer edit ends nothing that follows a hand
     opened.session.close()
-    opened.session._worker._thread.join(PATIENCE)
-    assert not opened.session._worker._thread.is_alive()
+    assert opened.session.jobs.wait_idle(timeout=PATIENCE)
     assert opened.page.errors == []
 
 
@@ -563,12 +595,13 @@ def test_cancelling_goes_back_to_what_was_shown_and_the_task_can_be_chosen_again
     before = opened.session.scenario
     opened.session.cancel()  # nothing is learned: there is nothing to cancel
     opened.settle()
-    assert opened.session.scenario == before and opened.page.cancellations == []
+    assert opened.session.scenario == before and opened.page.warnings == []
     begin_learning(opened)
     opened.session.cancel()
     opened.settle()
     assert opened.session.scenario == opened.shown == opened.page.adopted[-1] == before
-    assert (opened.page.cancellations, opened.page.errors) == (["lift_box"], [])
+    assert opened.page.warnings == ["Learning “lift_box” was cancelled. This is “draw_s” as before."]
+    assert opened.page.errors == [] and opened.page.progress.learning is None
     opened.session.undo()  # as if the other task had never been chosen
     assert opened.session.scenario == fresh("draw_s")
     opened.engine.unlearned = set()
@@ -598,7 +631,7 @@ def test_another_choice_supersedes_learning(opened, how):
     opened.settle()
     assert opened.shown == opened.session.scenario
     assert opened.shown.task == {"another task": "pots", "undo": "draw_s"}[how]
-    assert opened.page.errors == opened.page.cancellations == []
+    assert opened.page.errors == opened.page.warnings == []
 
 
 def test_moving_the_obstacle_does_not_begin_learning_anew(opened):
@@ -621,7 +654,8 @@ def test_the_first_task_can_be_cancelled_too_and_any_edit_begins_again():
         assert engine.learning.wait(PATIENCE)
         session.cancel()
         assert session.wait_idle(PATIENCE)
-        assert page.cancellations == ["draw_s"] and page.frames == []
+        (said,) = page.warnings
+        assert said.startswith("Learning “draw_s” was cancelled. Choose another") and page.frames == []
         engine.unlearned = set()
         session.edit("obstacle", **changing(session.scenario, obstacles=(at(1.0),)))
         assert session.wait_idle(PATIENCE)
@@ -641,7 +675,7 @@ def test_a_task_that_cannot_be_learned_leaves_the_picture_and_the_choice_before_
     with caplog.at_level(logging.CRITICAL):
         opened.session.choose_task("hopeless")
         opened.settle()
-    assert [str(error) for error in opened.page.errors] == ["they contradict each other"]
+    assert opened.page.errors == ["they contradict each other"]
     assert opened.session.scenario == opened.shown == opened.page.adopted[-1] == fresh("draw_s")
 
 

@@ -15,5 +15,4 @@ def page(server, robot):
 def panel(server):
     panel = panel_of(server)
     yield panel
-    panel.close()
     server.gui.reset()

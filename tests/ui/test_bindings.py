@@ -9,8 +9,8 @@ from scenes import avoiding
 from viser import _messages as messages  # noqa: TID251
 
 from dt_viz.scenario.scenario import View
+from dt_viz.ui.bindings import KEEP
 from dt_viz.ui.controls import Control
-from dt_viz.ui.panel.bindings import KEEP
 from dt_viz.ui.scene.handles import Handles
 
 SCENARIO = avoiding("draw_s", ())

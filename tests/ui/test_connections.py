@@ -24,18 +24,19 @@ from websockets.typing import Subprotocol
 from dt_viz.evaluate.protocol_client import OBSTACLE, LostError, ProtocolClient
 from dt_viz.obstacles.files import MAX_BYTES
 from dt_viz.scenario.tasks import TASKS
-from dt_viz.session.session import Pace
+from dt_viz.session.progress import Pace
 from dt_viz.ui import gate
 from dt_viz.ui.origins import Origin
+from dt_viz.ui.patches import GateError
 from dt_viz.ui.ruler import Ruler
-from dt_viz.ui.server import MAX_WAITING, Server
+from dt_viz.ui.server import Server
 
 PART = 512 * 1024
 """Size of a part of an upload, bytes, as in viser's own page."""
 PATIENCE = 90.0
 """Seconds that anything may take: the machine may be busy."""
 UPLOAD = "Mesh or point cloud"
-NUM_PLACES = 2
+NUM_PLACES, MAX_WAITING = 2, 8
 
 
 class Client(ProtocolClient):
@@ -62,7 +63,9 @@ class Client(ProtocolClient):
 @pytest.fixture(scope="module")
 def server(fits):
     allowed = [Origin.parse("https://demo.example.org")]
-    server = Server(TASKS, fits, task="draw_s", port=0, max_sessions=NUM_PLACES, allowed=allowed)
+    server = Server(
+        TASKS, fits, task="draw_s", port=0, max_sessions=NUM_PLACES, max_waiting=MAX_WAITING, allowed=allowed
+    )
     yield server
     server.close()
 
@@ -148,6 +151,9 @@ def test_the_page_is_not_given_out_under_such_a_name_either(url, server):
     page = f"http://127.0.0.1:{server.port}/"
     with urllib.request.urlopen(page) as answer:
         assert b"viser" in answer.read().lower()
+        policy = answer.headers["Content-Security-Policy"]
+        assert policy.endswith("frame-ancestors 'self' https://demo.example.org:443") and "default-src 'self'" in policy
+        assert answer.headers["X-Content-Type-Options"] == "nosniff"
     with pytest.raises(urllib.error.HTTPError) as refused:
         urllib.request.urlopen(urllib.request.Request(page, headers={"Host": "evil.example"}))
     assert refused.value.code == 421
@@ -205,7 +211,7 @@ async def test_open_sockets_are_bounded_too(url, server, monkeypatch):
         except ConnectionResetError:
             return True
 
-    monkeypatch.setattr(gate, "MAX_SOCKETS", 3)
+    monkeypatch.setattr(server.gate, "limits", replace(server.gate.limits, sockets=3))
     async with AsyncExitStack() as stack:
         sockets = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(4)]
         for each in sockets:
@@ -318,10 +324,10 @@ async def test_forged_values_change_nothing_and_break_nothing(url, server):
 
 
 @asynchronous
-async def test_a_flood_is_slowed_down(url):
+async def test_a_flood_is_slowed_down(url, server):
     async with visiting(url) as client:
         began = monotonic()
-        for _ in range(3 * gate.MAX_RATE):
+        for _ in range(3 * int(server.gate.limits.rate)):
             await client.send("NoSuchMessage")
         assert await answers(client)
         assert monotonic() - began > 1  # the second that it began in may have been over at once
@@ -418,7 +424,7 @@ async def test_files_that_were_given_up_are_not_held(url, server):
 
 
 def a_gate():
-    return gate.Gate(gate.Origins("127.0.0.1"), max_connections=1, max_upload=1, refused=lambda *_: None)
+    return gate.Gate(gate.Origins("127.0.0.1"), gate.Limits(1, upload=1), lambda *_: None)
 
 
 def test_a_viser_that_serves_in_another_way_is_refused(monkeypatch):
@@ -432,14 +438,14 @@ def test_a_viser_that_serves_in_another_way_is_refused(monkeypatch):
             stopped.append(self)
 
     monkeypatch.setattr(viser, "ViserServer", Other)
-    with pytest.raises(gate.GateError, match=r"viser .* has changed .*; accepted: viser 1\.1"):
+    with pytest.raises(GateError, match=r"viser .* has changed .*; accepted: viser 1\.1"):
         a_gate().open("127.0.0.1", 0, "")
     assert stopped
 
 
 def test_a_viser_with_other_messages_is_refused(monkeypatch):
     monkeypatch.delattr("viser._messages.SceneNodeDragMessage")
-    with pytest.raises(gate.GateError, match=r"SceneNodeDragMessage.*; accepted: viser 1\.1"):
+    with pytest.raises(GateError, match=r"SceneNodeDragMessage.*; accepted: viser 1\.1"):
         a_gate()
 
 

@@ -17,6 +17,7 @@ from dt_viz.scenario.paper_scenes import offered
 from dt_viz.scenario.scenario import View
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui import controls, gestures
+from dt_viz.ui.panel import LANE
 from dt_viz.ui.scene import handles
 from dt_viz.ui.scene.camera import camera_for
 
@@ -38,7 +39,7 @@ TURNS = [(0.0,) * 4, (math.nan, 0.0, 0.0, 0.0), (1e300, 0.0, 0.0, 0.0), (1.0, 0.
 @pytest.fixture(autouse=True)
 def _at_rest(page):
     """No presentation, and a camera that stays where it is put: something forged may have begun others."""
-    page.visitor._panel._presentation.on = False
+    page.visitor._panel.presentation.show(False)
     for switch in page.inputs:
         if switch.label in ("Orbit", "Lock camera") and switch.value:
             page.claim(switch, False)
@@ -289,7 +290,7 @@ def test_clicks_on_save_png_are_not_done_by_the_threads_that_welcome_visitors(pa
         page.claim(page["Save PNG"], True)
     assert page.gui._thread_executor.submit(lambda: True).result(timeout=20)
     answer.set()
-    page.visitor._panel._saver._thread.join(30)
+    assert page.session.jobs.wait_idle("picture", 30)
     assert [thread.name for thread in asked] == ["picture"]
 
 
@@ -312,7 +313,7 @@ def test_commands_do_what_the_controls_do_each_on_a_key_of_its_own(page):
     titles = [command.label for command in commands.values()][-len(SCENES) :]
     assert titles == [scene.title for scene in SCENES]
     page.give(by_key["2", None])
-    assert page.visitor._panel._beginnings.wait_idle(30)
+    assert page.session.jobs.wait_idle(LANE, 30)
     assert page.session.scenario.scene == SCENES[1].name
     page.session.leave_scene()
 
@@ -350,11 +351,11 @@ def test_a_command_that_is_forged_or_disabled_is_not_given(page):
 
 
 def test_the_presentation_goes_from_scene_to_scene_and_folds_no_panel(page, monkeypatch):
-    presentation, scenes = page.visitor._panel._presentation, [scene.name for scene in SCENES]
+    presentation, scenes = page.visitor._panel.presentation, [scene.name for scene in SCENES]
     page.session.leave_scene()
 
     def shown():
-        assert page.visitor._panel._beginnings.wait_idle(30)
+        assert page.session.jobs.wait_idle(LANE, 30)
         return page.session.scenario.scene
 
     def is_on():

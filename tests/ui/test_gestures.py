@@ -11,15 +11,17 @@ from scenes import avoiding, beside, biases, frame_at
 from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.panels import BASE_PANEL
-from dt_viz.scenario.scenario import View
+from dt_viz.scenario.scenario import OFFERS, View
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.frame import Stage
-from dt_viz.session.session import Pace
-from dt_viz.ui.panel.panel import PLOTS, VIEW_LABELS
+from dt_viz.session.progress import Pace
+from dt_viz.ui.tabs.show import IN_SCENE
 
 PACE = Pace(0.02, 10.0, 0)
 AREA = TASKS["draw_s"]().slice
-SWITCHES: dict[str, Any] = dict.fromkeys(set(VIEW_LABELS) - {"panels"}, True)
+PLOTS = ("joint_plots", "health_plots")
+SWITCHED = (*IN_SCENE, *PLOTS)
+SWITCHES: dict[str, Any] = dict.fromkeys(set(SWITCHED) - {"panels"}, True)
 NOTHING: dict[str, Any] = dict.fromkeys(SWITCHES, False)
 EVERYTHING = View(**SWITCHES, panels=(BASE_PANEL,))
 SCENARIO = avoiding("draw_s", Sphere(TASKS["draw_s"]().obstacle_position), view=EVERYTHING)
@@ -72,20 +74,20 @@ def test_the_slice_moves_along_the_arrow_that_is_dragged(drawn):
     np.testing.assert_allclose(moved.axes, AREA.axes, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", VIEW_LABELS)
+@pytest.mark.parametrize("name", SWITCHED)
 def test_each_layer_is_shown_while_its_checkbox_is_on(drawn, name):
-    arms, panel = drawn.visitor.arms, drawn.visitor._panel
+    arms, show = drawn.visitor.arms, drawn.visitor._panel.show
     beside_layers = {"arm": arms.arm, "ghost_arm": arms.ghost, "body_points": arms.body}
-    beside_layers |= {"joint_plots": panel.joints, "health_plots": panel.health}
+    beside_layers |= {"joint_plots": show.joints, "health_plots": show.health}
     picture = beside_layers[name] if name in beside_layers else drawn.visitor.pictures.layer(name)
     assert not picture.visible
-    drawn.claim(drawn[VIEW_LABELS[name]], True)
+    drawn.claim(drawn[OFFERS[name].label], True)
     assert picture.visible
-    if name not in PLOTS | {"arm"}:
+    if name not in {*PLOTS, "arm"}:
         arrays = shown_in(drawn, picture.node.name)
         assert all(np.isfinite(array.astype(float)).all() for array in arrays)
         assert name in {"ghost_arm", "table"} or max(np.ptp(array, axis=0).max() for array in arrays) > 0.05
-    drawn.claim(drawn[VIEW_LABELS[name]], False)
+    drawn.claim(drawn[OFFERS[name].label], False)
     assert not picture.visible
 
 

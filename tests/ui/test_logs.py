@@ -5,7 +5,9 @@ import logging
 
 import pytest
 
-from dt_viz.ui.logs import MAX_RECORDS, PERIOD, Terse
+from dt_viz.ui.logs import RateLimitFilter
+
+MAX_RECORDS, PERIOD = 5, 60.0
 
 
 class Clock:
@@ -25,7 +27,7 @@ def log(clock):
     """A logger and what it has written."""
     logger, written = logging.Logger("test"), io.StringIO()
     handler = logging.StreamHandler(written)
-    handler.addFilter(Terse(clock))
+    handler.addFilter(RateLimitFilter(MAX_RECORDS, PERIOD, clock))
     logger.addHandler(handler)
     return logger, written
 

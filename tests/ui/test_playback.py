@@ -9,6 +9,7 @@ import pytest
 from pages import PATIENCE
 
 from dt_viz.session.engine import ArmMotion
+from dt_viz.session.jobs import Jobs
 from dt_viz.session.robot_loop import RoundSettings
 from dt_viz.ui import playback as playback_module
 from dt_viz.ui.playback import Playback, at_moment
@@ -31,11 +32,15 @@ class Arm:
         self.q = q
 
 
+def unexpected(error):
+    pytest.fail(str(error))
+
+
 def playback_of(arm, draw, fail=None):
     """A playback of such an arm; what keeps it from moving fails the test, unless it is taken."""
-    playback = Playback(cast(Any, arm), draw, fail or (lambda error: pytest.fail(str(error))))
-    playback.begin()
-    return playback
+    playback, jobs = Playback(cast(Any, arm), draw), Jobs(unexpected)
+    playback.begin(jobs, fail or unexpected)
+    return playback, jobs
 
 
 class Player:
@@ -43,7 +48,7 @@ class Player:
 
     def __init__(self):
         self.arm, self.places = Arm(), []
-        self.playback = playback_of(self.arm, self.draw)
+        self.playback, self.jobs = playback_of(self.arm, self.draw)
 
     def draw(self):
         if self.playback.q is not None:
@@ -67,7 +72,7 @@ def player(monkeypatch):
     monkeypatch.setattr(playback_module, "SHORTEST", 1e4)  # its thread sleeps until it is closed
     player = Player()
     yield player
-    player.playback.close()
+    player.jobs.close()
 
 
 @pytest.mark.parametrize("moment", [0.0, 0.3, 1.7, 4.0, 9.0])
@@ -81,9 +86,9 @@ def test_both_arms_are_shown_at_the_same_moment(moment):
 def test_the_arm_moves_without_being_asked_to(monkeypatch):
     monkeypatch.setattr(playback_module, "SHORTEST", 1 / 200)
     arm, moved = Arm(), threading.Event()
-    playback = playback_of(arm, lambda: moved.set() if arm.q[0] > 0.1 else None)
+    _, jobs = playback_of(arm, lambda: moved.set() if arm.q[0] > 0.1 else None)
     assert moved.wait(PATIENCE)
-    playback.close()
+    jobs.close()
 
 
 def test_an_arm_that_cannot_move_is_said_to_and_waits_for_its_next_motion(monkeypatch):
@@ -99,20 +104,20 @@ def test_an_arm_that_cannot_move_is_said_to_and_waits_for_its_next_motion(monkey
         arm.advance = advance
 
     arm.advance, arm.stop = stuck, stop
-    playback = playback_of(arm, lambda: moved.set() if arm.q[0] > 0.1 else None, said.append)
+    _, jobs = playback_of(arm, lambda: moved.set() if arm.q[0] > 0.1 else None, said.append)
     assert moved.wait(PATIENCE)
-    playback.close()
+    jobs.close()
     assert [str(error) for error in said] == ["no way"]
 
 
 def test_nothing_moves_before_it_begins():
     """The page that it draws on is being built."""
     arm, drawn = Arm(), threading.Event()
-    playback = Playback(cast(Any, arm), drawn.set, lambda error: pytest.fail(str(error)))
+    playback, jobs = Playback(cast(Any, arm), drawn.set), Jobs(unexpected)
     assert not drawn.wait(0.2) and arm.asked == []
-    playback.begin()
+    playback.begin(jobs, unexpected)
     assert drawn.wait(PATIENCE)
-    playback.close()
+    jobs.close()
 
 
 def test_the_longer_a_picture_takes_the_fewer_there_are(monkeypatch):
@@ -125,9 +130,9 @@ def test_the_longer_a_picture_takes_the_fewer_there_are(monkeypatch):
         if len(begun) > 5:
             enough.set()
 
-    playback = playback_of(Arm(), draw)
+    _, jobs = playback_of(Arm(), draw)
     assert enough.wait(PATIENCE)
-    playback.close()
+    jobs.close()
     assert np.diff(begun)[1:].min() > 0.9 * 0.005 / playback_module.PART
 
 

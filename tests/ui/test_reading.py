@@ -1,12 +1,14 @@
 """Files are read one at a time over all visitors, and dropped where their visitor has left."""
 
 import threading
+from functools import partial
 
 import pytest
 from pages import PATIENCE, wait_until
 
 from dt_viz.errors import UnwantedError
-from dt_viz.ui.reading import Reader
+from dt_viz.session.jobs import Jobs
+from dt_viz.ui.tabs.from_file import LANE, turn
 
 
 class Visitor:
@@ -14,12 +16,13 @@ class Visitor:
 
     def __init__(self) -> None:
         self.waits, self.reads, self.let_go, self.done = (threading.Event() for _ in range(4))
-        self.reader = Reader(self.waits.set)
+        self.errors: list[Exception] = []
+        self.jobs = Jobs(self.errors.append)
         self.end = ""
 
     def read(self) -> None:
         try:
-            with self.reader.turn():
+            with turn(self.waits.set, partial(self.jobs.superseded, LANE)):
                 self.reads.set()
                 assert self.let_go.wait(PATIENCE)
             self.end = "read"
@@ -29,30 +32,29 @@ class Visitor:
         finally:
             self.done.set()
 
-    def begin(self) -> bool:
-        return self.reader.begin(self.read)
-
-    def begin_next(self, read) -> None:
-        """Begin once what is under way has ended."""
-        wait_until(lambda: self.reader.begin(read))
+    def begin(self) -> None:
+        self.jobs.submit(LANE, self.read)
 
 
 @pytest.fixture(name="first")
 def _first():
     first = Visitor()
     yield first
-    first.reader.close()
+    first.jobs.close()
     first.let_go.set()
+    assert first.errors == []
 
 
 @pytest.fixture(name="both")
 def _both(first):
     """One who has a file read and one who waits."""
     second = Visitor()
-    assert first.begin() and first.reads.wait(PATIENCE) and not first.waits.is_set()
-    assert second.begin() and second.waits.wait(PATIENCE)
+    first.begin()
+    assert first.reads.wait(PATIENCE) and not first.waits.is_set()
+    second.begin()
+    assert second.waits.wait(PATIENCE)
     yield first, second
-    second.reader.close()
+    second.jobs.close()
     second.let_go.set()
 
 
@@ -61,12 +63,12 @@ def test_a_second_visitor_is_told_to_wait_and_comes_next(both):
     assert not second.reads.wait(0.3)
     first.let_go.set()
     assert second.reads.wait(PATIENCE)
-    assert first.end == "read"
+    wait_until(lambda: first.end == "read")
 
 
 def test_what_was_read_for_a_visitor_who_has_left_is_dropped(both):
     first, second = both
-    first.reader.close()
+    first.jobs.close()
     first.let_go.set()
     assert first.done.wait(PATIENCE) and first.end == "left"
     assert second.reads.wait(PATIENCE)
@@ -74,19 +76,5 @@ def test_what_was_read_for_a_visitor_who_has_left_is_dropped(both):
 
 def test_who_leaves_while_waiting_is_not_waited_for(both):
     _, second = both
-    second.reader.close()
+    second.jobs.close()
     assert second.done.wait(PATIENCE) and second.end == "left" and not second.reads.is_set()
-
-
-def test_each_visitor_has_one_file_under_way(first):
-    assert first.begin() and first.reads.wait(PATIENCE)
-    assert not first.begin()
-    first.let_go.set()
-    assert first.done.wait(PATIENCE)
-    first.begin_next(first.read)
-
-
-def test_what_nobody_expects_is_logged_and_the_next_file_is_read(first, caplog):
-    assert first.reader.begin(lambda: 1 / 0)  # pyright: ignore[reportArgumentType]
-    first.begin_next(first.read)
-    assert "ZeroDivisionError" in caplog.text

@@ -3,9 +3,8 @@
 import html
 import re
 
-from dt_viz.ui.panel.about import AUTHORS, LEGEND, LINK, TITLE, keys_html, legend_html, paper_html
-from dt_viz.ui.panel.commands import Command, numbered
 from dt_viz.ui.scene import palette
+from dt_viz.ui.tabs.about import AUTHORS, LEGEND, LINK, TITLE, Command, keys_html, legend_html, numbered, paper_html
 
 
 def test_the_paper_is_named_with_all_authors_and_a_link_that_opens_beside_the_page():

@@ -19,8 +19,6 @@ from dt_viz.scenario.scenario import View
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.engine import ArmMotion
 from dt_viz.session.frame import Stage
-from dt_viz.ui.panel.panel import VIEW_LABELS
-from dt_viz.ui.panel.plots import NUM_SAMPLES, JointPlots, joint_curves
 from dt_viz.ui.scene.anchors import Anchors
 from dt_viz.ui.scene.arm import PEDESTAL, SEEN, ArmPicture
 from dt_viz.ui.scene.arm_layers import NUM_ARMS, Arms, Onion, arms_along, evenly_along
@@ -31,6 +29,8 @@ from dt_viz.ui.scene.rollouts import Middles, Rollouts
 from dt_viz.ui.scene.scene import OF_A_MOTION, OF_A_TASK, ScenePictures
 from dt_viz.ui.scene.slice import MovableSlice
 from dt_viz.ui.scene.starts import Starts
+from dt_viz.ui.tabs.plots import NUM_SAMPLES, JointPlots, joint_curves
+from dt_viz.ui.tabs.show import IN_SCENE
 
 ROBOT = load_jaco()
 REACHING = np.array([0.9, 3.6, 1.6, 0.4, 2.9, -0.3])
@@ -346,7 +346,7 @@ def test_plots_are_drawn_only_while_shown_with_the_limits_of_limited_joints(serv
 def test_every_layer_has_a_checkbox():
     switches = {f.name for f in fields(View) if f.type == "bool"}
     switches -= {"playing", "replay", "move_slice", "click_to_start", "handles", "bias_handles"}
-    assert set(VIEW_LABELS) == switches | {"panels"}
+    assert {*IN_SCENE, "joint_plots", "health_plots"} == switches | {"panels"}
 
 
 def test_a_joint_is_drawn_once_its_turn_is_seen(scene, robot):

@@ -20,10 +20,11 @@ from dt_viz.pictures.occupancy import occupancy_picture
 from dt_viz.pictures.sketchbook import Pictures
 from dt_viz.scenario.scenario import MAX_OBSTACLES, View
 from dt_viz.scenario.tasks import TASKS
-from dt_viz.ui.panel.obstacles import SHAPES, ObstaclePanel, add, delete, duplicate, name_of, with_room
 from dt_viz.ui.scene.handles import in_slice
 from dt_viz.ui.scene.obstacles import Obstacles, shaded
 from dt_viz.ui.scene.slice_layers import OccupancySlice
+from dt_viz.ui.tabs.world import SHAPES, add, add_obstacles, delete, duplicate, name_of, with_room
+from dt_viz.warning import Severity
 
 BALL = Sphere((0.0, -0.5, 0.4), 0.12)
 BOX = Box((0.1, -0.5, 0.5), (0.2, 0.1, 0.06), (0.9, 0.1, 0.3, -0.3))
@@ -125,10 +126,9 @@ def test_what_is_dragged_stays_in_the_slice_and_under_the_pointer():
 
 @pytest.fixture
 def opened(server):
-    bound, said = Bound(scenario(BALL)), []
-    panel = ObstaclePanel(server.gui, bound, lambda text, wrong: said.append((text, wrong)), later=lambda work: work())
-    yield SimpleNamespace(panel=panel, session=cast(Any, bound.edited), bound=bound, said=said)
-    panel.close()
+    bound = Bound(scenario(BALL))
+    files, session = add_obstacles(server.gui, bound), cast(Any, bound.edited)
+    yield SimpleNamespace(files=files, session=session, bound=bound, said=session.said)
     server.gui.reset()
 
 
@@ -205,7 +205,7 @@ def test_a_file_that_is_uploaded_becomes_an_obstacle(opened):
         "cloud.ply": (cloud.export(file_type="ply"), CloudObstacle, "4: cloud"),
     }
     for name, (content, shape, label) in files.items():
-        opened.panel.load(content, name, 0.001)
+        opened.files.load(content, name, 0.001)
         *_, added = opened.session.scenario.obstacles
         assert isinstance(added, shape) and added.radius == pytest.approx(0.04, abs=0.01)
         assert f"{opened.session.scenario.selected + 1}: {name_of(added)}" == label
@@ -231,46 +231,46 @@ BAD = {
 def test_a_bad_file_is_refused_with_what_was_found_and_the_scene_stays(opened, name):
     before = opened.session.scenario
     content, words = BAD[name]
-    opened.panel.load(content, name, 1.0)
-    ((text, wrong),) = opened.said
-    assert wrong and text.startswith(f"{name}: ") and "found " in text and "accepted: " in text
-    assert words in text and not opened.panel.again.visible
+    opened.files.load(content, name, 1.0)
+    ((text, severity),) = opened.said
+    assert severity is Severity.ALARM and text.startswith(f"{name}: ") and "found " in text and "accepted: " in text
+    assert words in text and not opened.files.again.visible
     assert opened.session.scenario == before and opened.session.steps == 0
 
 
 @pytest.mark.parametrize("suffix", ["stl", "obj", "ply", "glb", "gltf", "off", "3mf", "npz", "csv"])
 def test_what_is_too_large_is_not_even_looked_at(opened, suffix, monkeypatch):
     monkeypatch.setattr(shapes, "read_upload", None)
-    opened.panel.load(b"ply\n" * (shapes.MAX_BYTES // 4 + 1), f"huge.{suffix}", 1.0)
-    assert opened.said == [(f"huge.{suffix}: file: found 20.0 MB; accepted: at most 20 MB", True)]
+    opened.files.load(b"ply\n" * (shapes.MAX_BYTES // 4 + 1), f"huge.{suffix}", 1.0)
+    assert opened.said == [(f"huge.{suffix}: file: found 20.0 MB; accepted: at most 20 MB", Severity.ALARM)]
 
 
 def test_a_file_in_another_unit_is_read_in_that_once_it_is_asked_for(opened):
-    opened.panel.load(stl(BALL_MESH.copy().apply_scale(1000)), "ball.stl", 1.0)
+    opened.files.load(stl(BALL_MESH.copy().apply_scale(1000)), "ball.stl", 1.0)
     question = "ball.stl seems to be in millimetres: 80 × 80 × 80 units. Read it in millimetres?"
-    assert opened.said == [(question, False)]
-    assert opened.panel.again.visible and opened.panel.again.label == "Read it in millimetres"
+    assert opened.said == [(question, Severity.WARNING)]
+    assert opened.files.again.visible and opened.files.again.label == "Read it in millimetres"
     for _ in range(2):
-        opened.panel.load_again()
+        opened.files.load_again()
         _, added = opened.session.scenario.obstacles
         assert added.size == pytest.approx(0.08, abs=1e-3)
-        assert not opened.panel.again.visible and opened.panel.unit.value == "millimetres"
-    assert opened.said == [(question, False)]
+        assert not opened.files.again.visible and opened.files.unit.value == "millimetres"
+    assert opened.said == [(question, Severity.WARNING)]
 
 
 def test_a_file_whose_visitor_has_left_becomes_no_obstacle(opened):
     before = opened.session.scenario
-    opened.panel.close()
+    opened.session.jobs.close()
     with pytest.raises(UnwantedError):
-        opened.panel.load(stl(BALL_MESH), "ball.stl", 1.0)
+        opened.files.load(stl(BALL_MESH), "ball.stl", 1.0)
     assert opened.session.scenario == before and not opened.said
 
 
 def test_another_file_than_there_is_room_for_is_refused(opened):
     opened.session.edit("", **changing(opened.session.scenario, obstacles=(BALL,) * MAX_OBSTACLES))
-    opened.panel.load(stl(BALL_MESH), "ball.stl", 1.0)
-    ((text, wrong),) = opened.said
-    assert wrong and "delete one first" in text
+    opened.files.load(stl(BALL_MESH), "ball.stl", 1.0)
+    ((text, severity),) = opened.said
+    assert severity is Severity.ALARM and "delete one first" in text
 
 
 def test_large_meshes_are_drawn_with_fewer_triangles():

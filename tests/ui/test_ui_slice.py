@@ -17,7 +17,6 @@ from dt_viz.scenario.scenario import View
 from dt_viz.scenario.slices import SlicePose
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.frame import Stage
-from dt_viz.ui.panel.slice import WHOLE_ARM_NOTE, SlicePanel
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.colour_scale import NUM_SHADES, from_oklab, oklab, ramp
 from dt_viz.ui.scene.export import as_png
@@ -36,6 +35,7 @@ from dt_viz.ui.scene.slice_layers import (
     scale_of,
 )
 from dt_viz.ui.scene.tubes import NUM_SIDES
+from dt_viz.ui.tabs.show import WHOLE_ARM_NOTE, SlicePanel
 
 SCENARIO = avoiding("draw_s", (Sphere((0.0, -0.5, 0.4)),))
 POSE = SlicePose((0.1, -0.4, 0.5), (0.6, 0.8, 0.0, 0.0))

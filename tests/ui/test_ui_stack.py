@@ -15,8 +15,11 @@ from dt_viz.scenario.panels import BASE_PANEL
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.stack import IMITATION, WHOLE_ARM, anchored, avoiding_with, selected
 from dt_viz.scenario.tasks import TASKS
-from dt_viz.ui.panel.avoid import add_avoid_and_imitate, avoids_with
-from dt_viz.ui.panel.stack import (
+from dt_viz.ui.panel import add_avoid_and_imitate, avoids_with
+from dt_viz.ui.scene.anchors import Anchors
+from dt_viz.ui.scene.levels import LevelRollouts
+from dt_viz.ui.scene.tubes import NUM_SIDES
+from dt_viz.ui.tabs.stack import (
     BASE,
     DOWN,
     OFF,
@@ -31,10 +34,7 @@ from dt_viz.ui.panel.stack import (
     press,
     rows,
 )
-from dt_viz.ui.panel.transforms import add, add_transform_controls, delete
-from dt_viz.ui.scene.anchors import Anchors
-from dt_viz.ui.scene.levels import LevelRollouts
-from dt_viz.ui.scene.tubes import NUM_SIDES
+from dt_viz.ui.tabs.world import add_transform, add_transforms, delete_transform
 
 PLANE = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 AVOIDANCE = "Avoidance"
@@ -192,21 +192,21 @@ def test_bias_points_stand_where_they_are_and_the_one_that_was_clicked_has_handl
 def test_bias_points_are_added_changed_and_deleted():
     session: Any = Edited(changed(SCENARIO, layers=()))
     for _ in range(BiasPoint.most + 1):
-        add(session, BiasPoint)
+        add_transform(session, BiasPoint)
     points = anchored(session.scenario)
     assert len(points) == BiasPoint.most
     assert selected(session.scenario) == list(points)[-1]
     session.edit("select", view=View(bias="Bias 2"))
-    delete(session)
+    delete_transform(session)
     assert list(anchored(session.scenario)) == ["Bias 1", "Bias 3", "Bias 4"]
     for _ in range(4):
-        delete(session)
+        delete_transform(session)
     assert beside(session.scenario) == ()
 
 
 def test_the_panel_shows_what_auto_chose(server):
     bound = Bound(SCENARIO)
-    add_transform_controls(server.gui, bound, later=lambda work: work())
+    add_transforms(server.gui, bound)
     bound.adopt(replace(SCENARIO, view=View(bias="Bias 1")))
     bound.report(frame())
     radius = bound["Radius [cm]"].control

@@ -12,8 +12,8 @@ from dt_viz.motion.following import room_at_rest
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.scenario import MAX_STARTS, Start, View
 from dt_viz.scenario.starts import APART, INNER, followed, struck, with_grid, with_moved_start, with_start
-from dt_viz.ui.panel.starts import StartsPanel
 from dt_viz.ui.scene import palette
+from dt_viz.ui.tabs.world import add_starts
 
 
 def test_a_ray_meets_the_slice_where_it_is_seen(engine):
@@ -129,7 +129,7 @@ def test_balls_are_grey_while_nothing_moves_from_them(page):
 def test_a_label_is_chosen_for_new_starts_and_for_the_one_that_the_arm_follows(server):
     scenario = avoiding("draw_s")
     bound = Bound(scenario)
-    StartsPanel(server.gui, bound, lambda _text: None, lambda act: act())
+    add_starts(server.gui, bound)
     num = len(bound.edited.task.demonstrations)
     bound.adopt(scenario)
     (control,) = bound.inputs("Label", visible=False)  # nothing is known to have labels

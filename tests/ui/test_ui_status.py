@@ -23,12 +23,12 @@ from dt_viz.scenario.stack import avoiding_with
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Frame, Stage
-from dt_viz.session.session import Pace, Session
-from dt_viz.ui.panel.remedies import remedy
-from dt_viz.ui.panel.status import CHANGED, HINT, LEADING, PALE, details_html, hint
-from dt_viz.ui.panel.status_line import BUTTON, HEIGHT
-from dt_viz.ui.panel.verdict import COMPUTING, CONCERNS, FAILED, HOLDS, WARP_HINT, Level, Verdict, concerns, verdict
-from dt_viz.warning import ARM, Kind, MotionWarning
+from dt_viz.session.jobs import Jobs
+from dt_viz.session.progress import Message, Pace, Progress
+from dt_viz.session.session import Session
+from dt_viz.ui.tabs.status import BUTTON, CHANGED, HINT, LEADING, PALE, REASON, details_html, hint
+from dt_viz.ui.tabs.verdict import COMPUTING, FAILED, HOLDS, WARP_HINT, Verdict, concerns, remedy, verdict
+from dt_viz.warning import ARM, Concern, Kind, MotionWarning, Severity
 
 PACE = Pace(0.02, 10.0, 0)
 CLOSE = CollisionReport(
@@ -48,7 +48,7 @@ def frame(scenario: Scenario = HAND, **changes: Any) -> Frame:
 
 
 def verdict_of(told: Frame, adopted: Scenario | None = None) -> Verdict:
-    return verdict(told, PACE, adopted or told.scenario)
+    return verdict(Progress(adopted or told.scenario, told, PACE))
 
 
 def details_of(told: Frame) -> str:
@@ -60,8 +60,9 @@ def details_of(told: Frame) -> str:
 
 def test_what_is_sound_is_one_line_of_figures():
     said = verdict_of(frame(certificates=HOLDING))
-    assert said == Verdict("✓ safe · 12 mm · stable · 20 ms", Level.GOOD, HOLDS)
-    slow = verdict(frame(certificates=replace(HOLDING, lyapunov_falls=False)), Pace(1.26, 0, 0), WHOLE)
+    assert said == Verdict("✓ safe · 12 mm · stable · 20 ms", Severity.GOOD, HOLDS)
+    unstable = frame(certificates=replace(HOLDING, lyapunov_falls=False))
+    slow = verdict(Progress(WHOLE, unstable, Pace(1.26, 0, 0)))
     assert slow.line.endswith("not stable · 1.3 s")
     alone = replace(HOLDING, clearance=float("inf"), collision=replace(FAR, obstacle=Nearest(float("inf"), (), 0.0)))
     assert "no obstacle" in verdict_of(frame(certificates=alone)).line
@@ -103,7 +104,7 @@ def test_what_is_computed_says_so_and_a_warning_that_is_known_stays():
     looked_at = replace(told.scenario, view=View(rollouts=False))
     assert not verdict_of(told, looked_at).busy  # the frame has all that it needs
     live = verdict_of(frame(certificates=HOLDING.warning(ODD), stage=Stage.LIVE))
-    assert live.busy and (live.reason, live.level) == ("it is odd", Level.WARNING)
+    assert live.busy and (live.reason, live.severity) == ("it is odd", Severity.WARNING)
 
 
 def test_the_gravest_reason_comes_first_whatever_order_they_are_found_in():
@@ -117,10 +118,13 @@ def test_the_gravest_reason_comes_first_whatever_order_they_are_found_in():
         told = frame(certificates=HOLDING.warning(*found))
         assert [*concerns(told, View())] == by_concern
         assert verdict_of(told).reason == "it enters (and 3 more: see Details)"
-    for k, warning in enumerate(by_concern):
+    for concern, warning in zip(Concern, by_concern, strict=True):
         said = verdict_of(frame(certificates=HOLDING.warning(warning)))
-        assert said.line.startswith(CONCERNS[k].head) and said.level is CONCERNS[k].level
-    assert len({kind for concern in CONCERNS for kind in concern.kinds}) == sum(len(c.kinds) for c in CONCERNS)
+        assert said.line[2:].startswith(concern.value) and said.severity is concern.severity
+
+
+def test_what_hides_a_warning_is_a_kind():
+    assert {kind.cause for kind in Kind} - {""} <= set(Kind.__members__)
 
 
 @pytest.mark.parametrize(
@@ -132,7 +136,7 @@ def test_nothing_is_said_of_an_arm_that_is_hidden(view, told):
     details, said = details_of(shown), verdict_of(shown)
     for text in ("The arm is odd", "below the table", "Arm to obstacle", "finger"):
         assert (text in details) == told
-    assert (said.level is Level.GOOD) == (not told) and ("link 5" in said.reason) == told
+    assert (said.severity is Severity.GOOD) == (not told) and ("link 5" in said.reason) == told
     assert "It is odd" in details_of(replace(shown, certificates=known.warning(ODD)))  # of the rollouts
 
 
@@ -146,14 +150,14 @@ def test_motions_through_an_obstacle_are_a_collision_also_where_nothing_warns():
     inside = Certificates(-0.03, lyapunov_falls=True)
     for changes, why in (({"duration": 0.1}, "at this flow time"), ({"avoids": False}, "nothing avoids it")):
         said = verdict_of(frame(changed(HAND, **changes), certificates=inside))
-        assert said.level is Level.ALARM and why in said.reason and "−30 mm" in said.line
+        assert said.severity is Severity.ALARM and why in said.reason and "−30 mm" in said.line
 
 
 def test_a_warp_is_a_hint_and_what_it_enters_no_alarm():
     warped = replace(HAND, warp=0.5)
     inside = frame(warped, certificates=Certificates(-0.03, lyapunov_falls=True))
     assert concerns(inside, View()) == ()
-    assert (verdict_of(inside).level, verdict_of(inside).reason) == (Level.NOTE, WARP_HINT.format(0.5))
+    assert (verdict_of(inside).severity, verdict_of(inside).reason) == (Severity.NOTE, WARP_HINT.format(0.5))
     table = CollisionReport(Nearest(-0.04, ("finger 1",), 0), None, Nearest(-0.02, ("link 5",), 0))
     found = tuple(warning for warning in table.warnings if warning.kind is not Kind.ARM_ENTERS)  # as of a warp
     below = frame(warped, certificates=Certificates(-0.03, table, found=found))
@@ -164,7 +168,7 @@ def test_a_scenario_without_motion_says_why_and_what_is_shown_instead():
     texts = ("start 3 is inside the obstacle", "the obstacle touches the <base>")
     told = frame(blocked=tuple(MotionWarning(Kind.ARM_BLOCKED, text) for text in texts))
     said = verdict_of(told)
-    assert said.level is Level.ALARM and "; ".join(texts) in said.reason and "last good" in said.reason
+    assert said.severity is Severity.ALARM and "; ".join(texts) in said.reason and "last good" in said.reason
     assert "mm" not in said.line
     details = details_html(told, PACE, View())
     assert "The obstacle touches the &lt;base&gt;" in details
@@ -289,14 +293,37 @@ def test_a_remedy_mends_what_it_is_offered_for(name, engine: Engine):
     """Where only the hand's path is looked at: nothing is left to be told once the button is pressed."""
     scenario = avoiding("draw_s", IN_STROKE, view=View(arm=False, field=False), **SPOILED[name])
     *_, told = engine.frames(scenario)
-    assert verdict_of(told).level is not Level.GOOD
+    assert verdict_of(told).severity is not Severity.GOOD
     found = remedy(told, scenario)
     assert found is not None
     *_, told = engine.frames(replace(scenario, **found.changes))
-    assert verdict_of(told).level is Level.GOOD, verdict_of(told)
+    assert verdict_of(told).severity is Severity.GOOD, verdict_of(told)
 
 
 # --- What is shown when ---
+
+
+class Told:
+    """What a session tells its panel."""
+
+    def __init__(self, panel: Any, scenario: Scenario) -> None:
+        self.panel, self.progress = panel, Progress(scenario)
+        self.adopt(scenario)
+
+    def tell(self, **changes: Any) -> None:
+        self.progress = replace(self.progress, **changes)
+        self.panel.tell(self.progress)
+
+    def adopt(self, scenario: Scenario) -> None:
+        self.panel.adopt(scenario)
+        self.tell(wanted=scenario)
+
+    def report(self, shown: Frame) -> None:
+        self.panel.report(shown)
+        self.tell(shown=shown, pace=PACE)
+
+    def say(self, text: str, severity: Severity = Severity.ALARM) -> None:
+        self.tell(message=Message(text, severity, self.progress.wanted))
 
 
 def heights(panel) -> float:
@@ -307,18 +334,18 @@ def heights(panel) -> float:
 
 
 def test_nothing_moves_when_a_message_comes_or_something_is_learned(panel):
+    told = Told(panel, HAND)
     full = heights(panel)
-    panel.adopt(HAND)
     for act, text, mends, cancels in (
-        (lambda: panel.report(frame(certificates=HOLDING), PACE), "Every check", False, False),
-        (lambda: panel.report(frame(certificates=ENTERS), PACE), "Finger tip 1", True, False),
-        (lambda: panel.learning(0.4, "flow 2 of 3"), "learning the motion … 40 %", False, True),
-        (lambda: panel.learning(0.4, "flow 2 of 3"), "Flow 2 of 3", False, True),
-        (lambda: panel.cancelled("draw_s"), "was cancelled", False, False),
-        (lambda: panel.fail(ValueError("it fails")), "it fails", False, False),
+        (lambda: told.report(frame(certificates=HOLDING)), "Every check", False, False),
+        (lambda: told.report(frame(certificates=ENTERS)), "Finger tip 1", True, False),
+        (lambda: told.tell(learning=(0.4, "flow 2 of 3")), "learning the motion … 40 %", False, True),
+        (lambda: told.tell(learning=(0.4, "flow 2 of 3")), "Flow 2 of 3", False, True),
+        (lambda: told.tell(learning=None), "Finger tip 1", True, False),
+        (lambda: told.say("it fails"), "it fails", False, False),
     ):
         act()
-        assert heights(panel) == full >= HEIGHT
+        assert heights(panel) == full >= REASON
         assert text in html.unescape(panel.status.line.content)
         assert (panel.status.mend.visible, panel.status.cancel.visible) == (mends, cancels)
 
@@ -328,25 +355,17 @@ def test_hints_take_the_same_room_and_are_told_in_full(panel):
     texts = [scene.line for scene in SCENES.values()] + [entry().hint for entry in TASKS.values()] + [CHANGED, ""]
     rooms = set()
     for text in texts:
-        panel._give_hint(text)
+        panel.give_hint(text)
         rooms |= set(re.findall(r"<div style='height:([\d.]+)em", panel.hint.content))
         assert text in html.unescape(panel.hint.content)
         assert len(textwrap.wrap(text, 44)) * LEADING <= HINT
     assert rooms == {f"{HINT:.3f}"}
 
 
-def test_a_message_goes_with_the_next_scenario_that_is_shown(panel):
-    panel.adopt(HAND)
-    panel.fail(ValueError("it fails"))
-    for shown, stays in ((HAND, True), (changed(HAND, temperature=3.0), False)):
-        panel.report(frame(shown, certificates=HOLDING), PACE)
-        assert ("it fails" in panel.status.line.content) == stays
-
-
 def test_the_button_mends_what_the_session_has_now(panel):
     edited = Edited(HAND, panel)
     panel.connect(cast(Session, edited))
-    panel.report(frame(certificates=ENTERS), PACE)
+    Told(panel, HAND).report(frame(certificates=ENTERS))
     assert panel.status.mend.label == "Let the whole arm avoid"
     for _ in range(2):
         panel.status._mend(cast(Session, edited))
@@ -356,11 +375,12 @@ def test_the_button_mends_what_the_session_has_now(panel):
 def test_what_is_refused_is_said_beside_the_panel_too(server):
     said = []
     panel = panel_of(server, notify=lambda *told: said.append(told))
-    panel.fail(DemonstrationError("file.csv", "points", "3", "at least 20"))
+    told = Told(panel, HAND)
+    told.say("file.csv: points: found 3; accepted: at least 20")
+    told.report(frame())  # the message stays
     ((text, colour),) = said
-    assert "file.csv" in text and "at least 20" in text and text in html.unescape(panel.status.line.content)
+    assert "at least 20" in text and text in html.unescape(panel.status.line.content)
     assert colour[0] > 2 * max(colour[1:])  # red
-    panel.close()
     server.gui.reset()
 
 
@@ -372,61 +392,63 @@ def test_the_status_of_another_task_is_pale_and_says_what_is_done(panel):
     def hinted(said):
         return said.task.hint in html.unescape(panel.hint.content)
 
-    panel.adopt(scenario)
-    panel.report(first, PACE)
+    told = Told(panel, scenario)
+    told.report(first)
     settled = status.details.content
     assert COMPUTING not in status.line.content and hinted(first)
-    panel.adopt(other)
+    told.adopt(other)
     for _ in range(2):
         assert COMPUTING in status.line.content and status.details.content == f"<div style='{PALE}'>{settled}</div>"
         assert not hinted(first)
-        panel.report(first, PACE)  # what was under way when it was chosen
-    panel.report(second, PACE)
+        told.report(first)  # what was under way when it was chosen
+    told.report(second)
     assert COMPUTING not in status.line.content and hinted(second)
-    panel.adopt(scenario)
+    told.adopt(scenario)
     assert COMPUTING in status.line.content
-    panel.fail(ValueError("nothing comes"))
+    told.tell(failed=True)
     assert FAILED.line in status.line.content and COMPUTING not in status.line.content
-    panel.adopt(other)
-    panel.report(second, PACE)
-    assert FAILED.line not in status.line.content
+    told.adopt(other)
+    told.tell(failed=False)
+    assert FAILED.line not in status.line.content and hinted(second)
 
 
 def test_what_fails_beside_a_motion_that_is_known_leaves_its_verdict(panel):
-    panel.adopt(HAND)
-    panel.report(frame(certificates=HOLDING), PACE)
-    panel.fail(ValueError("no picture"))
+    told = Told(panel, HAND)
+    told.report(frame(certificates=HOLDING))
+    told.tell(failed=True)
+    told.say("no picture")
     assert "✓ safe" in panel.status.line.content and "no picture" in panel.status.line.content.lower()
 
 
-class Begun:
+class Begun(Told):
     """A session that begins what it is told to once it may."""
 
-    def __init__(self, scenario):
-        self.scenario, self.may, self.asked = scenario, threading.Event(), []
-        self.panel: Any = None
+    def __init__(self, panel, scenario):
+        self.may, self.asked = threading.Event(), []
+        self.jobs = Jobs(lambda error: self.say(str(error)))
+        super().__init__(panel, scenario)
+
+    def expect(self, expected):
+        self.tell(expected=expected)
 
     def choose_task(self, name):
         assert self.may.wait(30)
         self.asked.append(name)
         if name == "push_box":
             raise DemonstrationError("push.csv", "lines", "none", "two or more")
-        self.scenario = replace(self.scenario, task=name)
-        self.panel.adopt(self.scenario)
+        self.adopt(replace(self.progress.wanted, task=name))
 
 
 @pytest.mark.parametrize(("chosen", "settles"), [("lift_box", False), ("draw_s", True), ("push_box", True)])
 def test_choosing_a_task_keeps_nobody_waiting_and_says_at_once_what_is_done(panel, chosen, settles):
-    session = Begun(avoiding("draw_s", ()))
-    session.panel = panel
+    session = Begun(panel, avoiding("draw_s", ()))
     panel.connect(cast(Session, session))
-    panel.adopt(session.scenario)
-    panel.report(frame(session.scenario), PACE)
+    session.report(frame(session.progress.wanted))
     settled = panel.status.details.content, panel.hint.content
-    panel._begin(lambda session, name: session.choose_task(name), cast(Session, session), chosen)
+    panel.begin(lambda session, name: session.choose_task(name), cast(Session, session), chosen)
     assert COMPUTING in panel.status.line.content and session.asked == []
     session.may.set()
-    assert panel._beginnings.wait_idle(30)
+    assert session.jobs.wait_idle(timeout=30)
     assert session.asked == [chosen]
     assert (COMPUTING not in panel.status.line.content) == settles
     assert ((panel.status.details.content, panel.hint.content) == settled) == settles

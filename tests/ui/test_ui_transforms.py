@@ -16,11 +16,9 @@ from dt_viz.scenario.stack import IMITATION, anchored
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session import player as player_module
 from dt_viz.session.engine import Engine
-from dt_viz.session.player import Player
 from dt_viz.session.session import Session
-from dt_viz.ui.panel import warp as warp_module
-from dt_viz.ui.panel.transform_settings import add_transform_settings, learned_html
-from dt_viz.ui.panel.warp import grown
+from dt_viz.ui.tabs import stack as stack_module
+from dt_viz.ui.tabs.stack import add_transform_settings, grown, learned_html
 
 AVOIDANCE = "Avoidance"
 SCENARIO = avoiding("draw_s", Sphere((0.0, -0.5, 0.4)), layers=biases(BiasPoint((0.2, -0.5, 0.4))))
@@ -144,10 +142,12 @@ def session():
 
 
 def play_warp(session, told, seconds, monkeypatch):
-    monkeypatch.setattr(warp_module, "SECONDS", seconds)
-    player = Player(told.append)
-    player.start(session, "Warp", grown)
-    return player
+    monkeypatch.setattr(stack_module, "SECONDS", seconds)
+    player_module.start(session, "Warp", grown, told.append)
+
+
+def plays(session):
+    return session.jobs.busy(player_module.LANE)
 
 
 def test_playing_goes_from_straight_rays_to_the_full_stack_as_one_step_for_undo(session, monkeypatch):
@@ -180,21 +180,30 @@ def test_playing_that_ends_as_it_began_leaves_nothing_to_undo(session, monkeypat
 
 def test_playing_stops_when_it_is_told_to_or_something_else_is_moved(session, monkeypatch):
     told = []
-    player = play_warp(session, told, 1000.0, monkeypatch)
+    play_warp(session, told, 1000.0, monkeypatch)
     wait_until(lambda: session.scenario.warp < 0.5)
     session.edit("view", view=View(grid=True))  # moves nothing
-    assert player.playing
-    player.stop()
-    wait_until(lambda: not player.playing)
+    assert plays(session)
+    player_module.stop(session)
+    wait_until(lambda: not plays(session))
     assert told == [True, False]
-    player.start(session, "Warp", grown)
+    player_module.start(session, "Warp", grown, told.append)
     wait_until(lambda: told == [True, False, True])
     session.edit("obstacle", **changing(session.scenario, obstacles=(), warp=0.9))
-    wait_until(lambda: not player.playing)
+    wait_until(lambda: not plays(session))
     assert session.scenario.warp == 0.9
 
 
+def test_of_two_things_that_are_played_the_second_ends_the_first(session, monkeypatch):
+    told = {"warp": [], "other": []}
+    play_warp(session, told["warp"], 1000.0, monkeypatch)
+    wait_until(lambda: told["warp"] == [True])
+    player_module.start(session, "Other", lambda _scenario, _seconds: None, told["other"].append)
+    wait_until(lambda: not plays(session))
+    assert told == {"warp": [True, False], "other": [True, False]}
+
+
 def test_closing_ends_playing(session, monkeypatch):
-    player = play_warp(session, [], 1000.0, monkeypatch)
-    player.close()
-    assert not player.playing
+    play_warp(session, [], 1000.0, monkeypatch)
+    session.close()
+    wait_until(lambda: not plays(session))

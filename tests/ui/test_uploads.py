@@ -3,7 +3,7 @@
 import pytest
 
 from dt_viz.errors import DataError
-from dt_viz.ui.uploads import MAX_PARTS, MalformedError, Upload
+from dt_viz.ui.gate import MalformedError, Upload
 
 
 @pytest.fixture
@@ -47,7 +47,7 @@ def test_parts_that_do_not_add_up_to_what_was_announced_come_from_no_page(upload
 
 @pytest.mark.parametrize(
     ("num_bytes", "num_parts"),
-    [(-1, 1), (10, 0), (10, -1), (10, 11), (0, 1), (1000, 1001), (MAX_PARTS + 1, MAX_PARTS + 1)],
+    [(-1, 1), (10, 0), (10, -1), (10, 11), (0, 1), (1000, 1001), (Upload.max_parts + 1, Upload.max_parts + 1)],
 )
 def test_numbers_of_parts_that_no_file_has_come_from_no_page(num_bytes, num_parts):
     with pytest.raises(MalformedError):

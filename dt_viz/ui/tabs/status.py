@@ -1,41 +1,39 @@
-"""What the panel says of a frame, as HTML: a line of figures, the reason that matters most, and all details."""
+"""The status: one line, one reason in a place of a fixed height, a button that mends it, and all details."""
 
 from __future__ import annotations
 
 import html
 from collections.abc import Iterator, Mapping
 
+import viser
+
 from dt_viz.robot.collision import SELF_REACH, CollisionReport
 from dt_viz.scenario.paper_scenes import SCENES
 from dt_viz.scenario.scenario import View
 from dt_viz.session.frame import Frame, Stage
-from dt_viz.session.session import Pace
-from dt_viz.ui.panel.verdict import Level, Verdict, concerns, shows_arm
+from dt_viz.session.progress import Pace, Progress
+from dt_viz.session.session import Session
+from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.scene.palette import ink, paper
 from dt_viz.ui.scene.picture import Colour
-from dt_viz.warning import in_millimetres
+from dt_viz.ui.tabs.plots import small
+from dt_viz.ui.tabs.verdict import Verdict, concerns, remedy, shows_arm, verdict
+from dt_viz.warning import MotionWarning, Severity, in_millimetres
 
 CHANGED = "The scene is changed. “Reset” brings it back as it was."
-COLOURS: Mapping[Level, tuple[Colour, Colour]] = {
-    Level.GOOD: ((0, 92, 66), (230, 245, 239)),
-    Level.NOTE: ((29, 79, 124), (232, 241, 250)),
-    Level.WARNING: ((138, 75, 0), (255, 244, 224)),
-    Level.ALARM: ((179, 38, 30), (253, 236, 234)),
+COLOURS: Mapping[Severity | None, tuple[Colour, Colour]] = {
+    None: ((84, 88, 96), (240, 242, 245)),
+    Severity.GOOD: ((0, 92, 66), (230, 245, 239)),
+    Severity.NOTE: ((29, 79, 124), (232, 241, 250)),
+    Severity.WARNING: ((138, 75, 0), (255, 244, 224)),
+    Severity.ALARM: ((179, 38, 30), (253, 236, 234)),
 }
-"""Ink and paper of each level."""
-BUSY_COLOURS = (84, 88, 96), (240, 242, 245)
+"""Ink and paper of each severity, and those of what is not known yet."""
 PALE = "opacity:0.3;filter:grayscale(1)"
-LINE = 2.0
-"""Height of the line of figures, em of its text."""
 LEADING = 1.35 * 0.8
 """Height of a line of small text, em."""
-HINT, WARNINGS = 3.3, 5.2
-"""Heights of the places of the hint, and of the warnings in the details, em."""
-INK = (40, 44, 52)
-"""Colour of the hint."""
-ROUNDING = 1e-12
-"""Length below which an error is rounding, metres."""
-SMALL = "font-size:0.8em;line-height:1.35;padding:0.1em 0.9em 0.35em;opacity:0.85"
+HINT, REASON, BUTTON = 3.3, 4.5, 2.25
+"""Heights of the places of the hint and of the reason, and of a button in the latter, em."""
 ROWS: Mapping[str, str] = {
     "Rebuild": "Time from the last change until its motion was shown. Changes that a newer one overtook are skipped.",
     "Clearance": "Smallest distance from the obstacles of what gives way to them: the end effector, or the body points "
@@ -64,9 +62,9 @@ def hint(frame: Frame) -> str:
 
 def line_html(verdict: Verdict) -> str:
     """Return the one line of figures, in the colour of its gravity."""
-    text, pale = BUSY_COLOURS if verdict.busy else COLOURS[verdict.level]
+    text, pale = COLOURS[None if verdict.busy else verdict.severity]
     return (
-        f"<div role='status' style='margin:0.2em 0.7em 0.3em;padding:0 0.6em;height:{LINE}em;line-height:{LINE}em;"
+        f"<div role='status' style='margin:0.2em 0.7em 0.3em;padding:0 0.6em;height:2em;line-height:2em;"
         f"font-size:0.85em;font-weight:600;white-space:nowrap;overflow:hidden;text-overflow:ellipsis;"
         f"border-left:3px solid {ink(text)};color:{ink(text)};background:{paper(pale, text)}'>"
         f"{html.escape(verdict.line)}</div>"
@@ -84,9 +82,14 @@ def place_html(text: str, colour: Colour, height: float, below: str = "") -> str
     )
 
 
+def hint_html(text: str) -> str:
+    """Return the hint in its place."""
+    return place_html(text, (40, 44, 52), HINT)
+
+
 def progress_html(fraction: float) -> str:
     """Return a bar of progress, from 0 to 1."""
-    full, pale = COLOURS[Level.NOTE]
+    full, pale = COLOURS[Severity.NOTE]
     return (
         f"<div style='height:0.35em;margin-top:0.25em;border-radius:2px;background:{paper(pale, full)}'>"
         f"<div style='height:100%;width:{100 * fraction:.0f}%;border-radius:2px;background:{ink(full)}'></div></div>"
@@ -101,12 +104,20 @@ def details_html(frame: Frame, pace: Pace, view: View) -> str:
         f"<td style='font-weight:600;overflow-wrap:anywhere'>{html.escape(value)}</td></tr>"
         for name, value in _rows(frame, pace, view)
     )
-    told = concerns(frame, view)
-    said = "".join(alarm(str(warning), *COLOURS[Level.WARNING]) for warning in told)
-    if frame.blocked:
-        said = "".join(alarm(str(warning), *COLOURS[Level.ALARM]) for warning in frame.blocked) + said
     # a place of its own height: warnings that come and go move nothing below them
-    return f"<table style='{SMALL}'>{cells}</table><div style='height:{WARNINGS}em;overflow-y:auto'>{said}</div>"
+    warnings = _boxes(frame.blocked, Severity.ALARM) + _boxes(concerns(frame, view), Severity.WARNING)
+    return small(f"<table>{cells}</table>") + f"<div style='height:5.2em;overflow-y:auto'>{warnings}</div>"
+
+
+def _boxes(warnings: tuple[MotionWarning, ...], severity: Severity) -> str:
+    """Return warnings in boxes of their colour."""
+    colour, background = COLOURS[severity]
+    return "".join(
+        "<div style='font-size:0.8em;margin:0.2em 0.9em 0.5em;padding:0.35em 0.6em;"
+        f"border-left:3px solid {ink(colour)};color:{ink(colour)};background:{paper(background, colour)}'>"
+        f"{html.escape(sentence(str(warning)))}</div>"
+        for warning in warnings
+    )
 
 
 def _rows(frame: Frame, pace: Pace, view: View) -> Iterator[tuple[str, str]]:
@@ -133,7 +144,7 @@ def _rebuild(pace: Pace) -> str:
 
 def error_text(length: float) -> str:
     """Format a length, metres, that should be zero: rounding is exact."""
-    if length < ROUNDING:
+    if length < 1e-12:  # metres
         return "exact"
     return "< 0.001 mm" if length < 1e-6 else in_millimetres(length)
 
@@ -188,10 +199,43 @@ def sentence(text: str) -> str:
     return text if "." in text.split(" ", 1)[0] else text[:1].upper() + text[1:]
 
 
-def alarm(text: str, colour: Colour, background: Colour) -> str:
-    """Return a text in a coloured box."""
-    return (
-        "<div style='font-size:0.8em;margin:0.2em 0.9em 0.5em;padding:0.35em 0.6em;"
-        f"border-left:3px solid {ink(colour)};color:{ink(colour)};background:{paper(background, colour)}'>"
-        f"{html.escape(sentence(text))}</div>"
-    )
+class StatusLine:
+    """The controls of the status. They keep their height whatever comes: a button takes its room from the reason's."""
+
+    def __init__(self, gui: viser.GuiApi, bindings: Bindings) -> None:
+        """Build the controls where the panel is being built; the buttons act on the session of the bindings."""
+        self._shown: Frame | None = None
+        self.line = gui.add_html("")
+        self.mend = gui.add_button("Mend", icon=viser.Icon.SHIELD_CHECK, visible=False)
+        self.cancel = gui.add_button("Cancel", icon=viser.Icon.X, visible=False)
+        with gui.add_folder("Details", expand_by_default=False):
+            self.details = gui.add_html("")
+        bindings.on(self.cancel, lambda session, _pressed: session.cancel())
+        bindings.on(self.mend, lambda session, _pressed: self._mend(session))
+
+    def tell(self, progress: Progress) -> None:
+        """Show what is known of what is wanted; called by one thread after the other."""
+        known, below = verdict(progress), ""
+        text, severity = known.reason, known.severity
+        if progress.message is not None:
+            text, severity = progress.message.text, progress.message.severity
+        if progress.learning is not None:
+            (fraction, text), severity = progress.learning, Severity.NOTE
+            below = progress_html(fraction)
+        self._shown = frame = progress.shown
+        mends = None
+        if frame is not None and progress.message is None and not progress.stale:
+            mends = remedy(frame, progress.wanted)
+        if mends is not None:
+            self.mend.label = mends.label
+        self.mend.visible, self.cancel.visible = mends is not None, progress.learning is not None
+        room = REASON - BUTTON if self.mend.visible or self.cancel.visible else REASON
+        self.line.content = line_html(known) + place_html(text, COLOURS[severity][0], room, below)
+        if frame is not None:
+            details = details_html(frame, progress.pace, progress.wanted.view)
+            self.details.content = f"<div style='{PALE}'>{details}</div>" if progress.stale else details
+
+    def _mend(self, session: Session) -> None:
+        found = None if self._shown is None else remedy(self._shown, session.scenario)
+        if found is not None:
+            session.step(found.label, **found.changes)

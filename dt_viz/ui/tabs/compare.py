@@ -1,4 +1,4 @@
-"""Comparison of other methods with ours, around the obstacle under the hand."""
+"""The tab "Compare": other methods beside ours, around the obstacle under the hand."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from dt_viz.motion.profiles import NUM_SAMPLES
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.session.comparison import OTHERS, OURS
 from dt_viz.session.frame import Compared
-from dt_viz.ui.panel.bindings import Bindings
-from dt_viz.ui.panel.plots import LOOK, SMALL, columns
+from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.comparison import COLOURS
 from dt_viz.ui.scene.palette import css
+from dt_viz.ui.tabs.plots import add_plot, columns, curve, small
 
 NONE = "–"
 SHORT = {
@@ -29,11 +29,8 @@ SHORT = {
     "eflow-repulsive": "EFlow, field",
 }
 """Names of methods that fit beside a box, where the title does not."""
-HEIGHT = 130
-"""Height of a plot, pixels."""
 DEEP = 0.001
 """Maximum collision distance from which on it is marked, metres."""
-_MILLIMETRES = 1e3
 COLUMNS = (
     ("to demo", "mean discrete Fréchet distance to the demonstrations"),
     ("hand in", "maximum collision distance of the end effector"),
@@ -49,7 +46,8 @@ class ComparePanel:
 
     def __init__(self, gui: viser.GuiApi, bindings: Bindings) -> None:
         """Build the controls in the tab that is open."""
-        self._gui, self._drawn = gui, ()
+        self._drawn: tuple[str, ...] = ()
+        """Names of the methods in the plots."""
         with gui.add_folder("Methods"):  # closed by a click, so that the table is seen at once on a small screen
             for method in OTHERS:
                 label = SHORT.get(method.name, method.title)
@@ -67,13 +65,9 @@ class ComparePanel:
         )
         self.folder = gui.add_folder("Along the path (fig. 6)", visible=False)
         with self.folder:
-            self.plots = tuple(self._plot(title) for title in TITLES)
+            self.plots = tuple(add_plot(gui, title, "path", _curves(()), 130) for title in TITLES)
         bindings.properties(self.folder, visible=lambda s: bool(s.view.compared))
         bindings.properties(self.table, visible=lambda s: bool(s.view.compared))
-
-    def _plot(self, title: str) -> viser.GuiUplotHandle:
-        self._gui.add_html(_small(title))
-        return self._gui.add_uplot((np.zeros(2),) * 2, tuple(_series(())), **{**LOOK, "height": HEIGHT})
 
     def draw(self, comparison: Sequence[Compared]) -> None:
         """Show how methods fare; nothing leaves what is there."""
@@ -82,11 +76,11 @@ class ComparePanel:
         self.table.content = table_html(comparison)
         plotted = [compared for compared in comparison if compared.curves is not None]
         names = tuple(compared.method.name for compared in plotted)
-        curves = [_MILLIMETRES * compared.curves for compared in plotted if compared.curves is not None]
+        curves = [1e3 * compared.curves for compared in plotted if compared.curves is not None]
         along = np.linspace(0, 1, NUM_SAMPLES)
         for k, plot in enumerate(self.plots):
             if names != self._drawn:
-                plot.series = tuple(_series(names))
+                plot.series = (uplot.Series(label="path"), *_curves(names))
             plot.data = columns(along, *(curve[:, k] for curve in curves)) if curves else (np.zeros(2),) * 2
         self._drawn = names
 
@@ -108,7 +102,7 @@ def table_html(comparison: Sequence[Compared]) -> str:
     head = f"<tr><th style='{pale};text-align:left'>mm</th>{heads}</tr>"
     rows = "".join(_row(compared) for compared in comparison)
     table = f"<table style='border-collapse:collapse;width:100%'>{head}{rows}</table>"
-    return f"<div style='{SMALL}'>{table}</div>"
+    return small(table, tight=True)
 
 
 _CELL = "font-weight:600;text-align:right;padding:0 0 0 0.4em;white-space:nowrap"
@@ -131,7 +125,7 @@ def _row(compared: Compared) -> str:
 
 
 def _cell(metres: float | None, *, bad: bool) -> str:
-    text = NONE if metres is None else f"{_MILLIMETRES * metres:.0f}"
+    text = NONE if metres is None else f"{1e3 * metres:.0f}"
     colour = f";color:{palette.ink(palette.FOLDED)}" if bad else ""
     return f"<td style='{_CELL}{colour}'>{text}</td>"
 
@@ -140,12 +134,8 @@ def _colour(name: str) -> tuple[int, int, int]:
     return COLOURS.get(name, palette.ROLLOUT)
 
 
-def _series(names: Sequence[str]) -> list[uplot.Series]:
-    curves = [
-        uplot.Series(label=name, stroke=css(_colour(name)), width=2, points={"show": False})
-        for name in (names or (OURS.name,))
-    ]
-    return [uplot.Series(label="path"), *curves]
+def _curves(names: Sequence[str]) -> tuple[uplot.Series, ...]:
+    return tuple(curve(name, _colour(name)) for name in (names or (OURS.name,)))
 
 
 def _is_compared(name: str, scenario: Scenario) -> bool:
@@ -166,7 +156,3 @@ def _with_their_arm(scenario: Scenario, name: str) -> dict[str, Any]:
 
 def _ordered(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(method.name for method in OTHERS if method.name in names)
-
-
-def _small(text: str) -> str:
-    return f"<div style='{SMALL}'>{text}</div>"

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-from dt_viz.scenario.scenario import Scenario
+import viser
+
+from dt_viz.scenario.scenario import OFFERS, Scenario, View
 from dt_viz.session.frame import Frame
 from dt_viz.session.session import Session
 from dt_viz.ui.controls import Control, on_command
 
 KEEP: Any = object()
 """Value of a binding that leaves what is shown as it is."""
+EDITS = "edits"
+"""Lane of the session's jobs for edits that take longer than the server's event loop may wait."""
 
 
 @dataclass
@@ -81,6 +85,44 @@ class Bindings:
             handle, read, lambda session, value: session.edit(handle.label, **change(session.scenario, value))
         )
 
+    def field(self, handle: Any, name: str) -> Control:  # noqa: ANN401
+        """Bind an input to a field of the scenario."""
+        return self.input(handle, lambda s: getattr(s, name), lambda _s, value: {name: value})
+
+    def view(
+        self,
+        handle: Any,  # noqa: ANN401
+        name: str,
+        shown: Callable[[Any], Any] = lambda value: value,
+        meant: Callable[[Any], Any] = lambda value: value,
+    ) -> Control:
+        """Bind an input to a field of `View`: `shown` is its value for the field's, `meant` the field's for its own."""
+        return self.input(
+            handle,
+            lambda s: shown(getattr(s.view, name)),
+            lambda s, value: {"view": replace(s.view, **{name: meant(value)})},
+        )
+
+    def checkbox(self, gui: viser.GuiApi, name: str, **options: Any) -> Control:  # noqa: ANN401
+        """Add the checkbox of a field of `View` where the panel is being built; the options are viser's."""
+        handle = gui.add_checkbox(OFFERS[name].label, bool(getattr(View(), name)), hint=OFFERS[name].hint, **options)
+        return self.view(handle, name, bool)
+
+    def slider(
+        self,
+        gui: viser.GuiApi,
+        name: str,
+        low: float,
+        high: float,
+        step: float,
+        **options: Any,  # noqa: ANN401
+    ) -> Any:  # noqa: ANN401 - viser's handle
+        """Add the slider of a field of `View` likewise, and return its handle."""
+        initial = getattr(View(), name)
+        handle = gui.add_slider(OFFERS[name].label, low, high, step, initial, hint=OFFERS[name].hint, **options)
+        self.view(handle, name, meant=type(initial))
+        return handle
+
     def choice(
         self,
         handle: Any,  # noqa: ANN401
@@ -92,7 +134,7 @@ class Bindings:
         self.properties(control, value=read)
         return control
 
-    def on(self, handle: Any, act: Callable[[Session, Any], None]) -> Control:  # noqa: ANN401
+    def on(self, handle: Any, act: Callable[[Session, Any], object]) -> Control:  # noqa: ANN401
         """Call `act`, which must only submit, with each new value of an input, or press of a button."""
 
         def acts(value: Any) -> None:  # noqa: ANN401
@@ -100,6 +142,10 @@ class Bindings:
                 act(self._session, value)
 
         return Control(handle, acts)
+
+    def later(self, handle: Any, act: Callable[[Session, Any], None]) -> Control:  # noqa: ANN401
+        """Do `act` with each press of a button, one after the other, beside the server's event loop."""
+        return self.on(handle, lambda session, value: session.jobs.submit(EDITS, partial(act, session, value)))
 
     def on_command(self, command: Any, act: Callable[[Session], None]) -> None:  # noqa: ANN401
         """Call `act`, which must only submit, when a command of the palette is given."""

@@ -14,14 +14,13 @@ from dt_viz.flows.diffeomorphisms import MAX_STEPS, Method
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import WHOLE_ARM, transform_of, with_transform
 from dt_viz.session.frame import Frame
+from dt_viz.ui.bindings import KEEP, Bindings
 from dt_viz.ui.controls import Control
-from dt_viz.ui.panel.bindings import KEEP, Bindings
 
 Chosen = Callable[[Scenario], str | None]
 """Function that returns the name of the layer whose settings are shown; None where there is none."""
 Offered = Callable[[type[Transform]], Iterable[Setting]]
 """Function that returns the settings of a kind that are shown."""
-METHOD_LABELS: Mapping[Method, str] = {"auto": "auto", "rk4": "RK4", "euler": "Euler (the paper's)"}
 
 
 def add_settings(
@@ -37,7 +36,16 @@ def add_settings(
         order: order of all of them in the folder.
     """
     for setting in dict.fromkeys(setting for kind in registry.KINDS for setting in offered(kind)):
-        _BUILDERS[type(setting)](gui, _SettingField(bindings, offered, chosen, setting), setting, order)
+        _SettingField(gui, bindings, offered, chosen, setting).add({"order": order, "visible": False})
+
+
+def settings_of_purpose(kind: type[Transform]) -> tuple[Setting, ...]:
+    """Return the settings of a kind that are about what it is for, not about its flow."""
+    return tuple(
+        setting
+        for setting in kind.settings
+        if isinstance(setting, Switch) or (isinstance(setting, Number) and not setting.of_flow)
+    )
 
 
 def chosen_values(frame: Frame) -> dict[str, Mapping[str, float]]:
@@ -52,6 +60,7 @@ def chosen_values(frame: Frame) -> dict[str, Mapping[str, float]]:
 class _SettingField:
     """The field of the chosen transform that a setting is about."""
 
+    gui: viser.GuiApi
     bindings: Bindings
     offered: Offered
     chosen: Chosen
@@ -104,68 +113,59 @@ class _SettingField:
         name = None if scenario is None else self.chosen(scenario)
         return None if name is None or frame is None else chosen_values(frame).get(name, {}).get(self.setting.field)
 
+    def add(self, given: dict[str, Any]) -> None:
+        """Build its controls where the panel is being built, with the options of viser that are given."""
+        gui, setting = self.gui, self.setting
+        match setting:
+            case Number():
+                self._add_number(setting, given)
+            case Switch():
+                box = gui.add_checkbox(setting.label, False, hint=setting.hint, **given)
+                self.bind(box, bool, lambda _before, on: on)
+            case Choice():
+                keys = {label: key for key, label in setting.options.items()}
+                choice = gui.add_dropdown(setting.label, tuple(keys), hint=setting.hint, **given)
+                self.bind(choice, lambda value: setting.options[value], lambda _before, label: keys[label])
+            case FlowIntegration():
+                self._add_integration(given)
+            case _:
+                raise TypeError(f"no control for a {type(setting).__name__}")
 
-def _add_number(gui: viser.GuiApi, field: _SettingField, setting: Number, order: float | None) -> None:
-    def shown(value: float | None) -> float:
-        """Return what the slider shows: while it is automatic what was chosen, to go on from by hand."""
-        value = field.suggestion() if value is None else value
-        if value is None:
-            return KEEP
-        return min(max(round(value * setting.scale, 3 if setting.scale == 1 else 1), setting.low), setting.high)
+    def _add_number(self, setting: Number, given: dict[str, Any]) -> None:
+        def shown(value: float | None) -> float:
+            """Return what the slider shows: while it is automatic what was chosen, to go on from by hand."""
+            value = self.suggestion() if value is None else value
+            if value is None:
+                return KEEP
+            return min(max(round(value * setting.scale, 3 if setting.scale == 1 else 1), setting.low), setting.high)
 
-    if setting.automatic:
-        field.bind(
-            gui.add_checkbox(f"{setting.label}: auto", True, order=order, visible=False, hint=setting.hint),
-            lambda value: value is None,
-            lambda _before, auto: None if auto else slider.value / setting.scale,
+        if setting.automatic:
+            self.bind(
+                self.gui.add_checkbox(f"{setting.label}: auto", True, hint=setting.hint, **given),
+                lambda value: value is None,
+                lambda _before, auto: None if auto else slider.value / setting.scale,
+            )
+        limits = setting.low, setting.high, setting.step, setting.initial
+        hint = None if setting.automatic else setting.hint
+        slider = self.bind(
+            self.gui.add_slider(f"{setting.label} {setting.unit}", *limits, hint=hint, **given),
+            shown,
+            lambda before, number: None if before is None else number / setting.scale,
         )
-    slider = field.bind(
-        gui.add_slider(
-            f"{setting.label} {setting.unit}",
-            setting.low,
-            setting.high,
-            setting.step,
-            setting.initial,
-            order=order,
-            visible=False,
-            hint=None if setting.automatic else setting.hint,
-        ),
-        shown,
-        lambda before, number: None if before is None else number / setting.scale,
-    )
-    field.bindings.properties(slider.handle, disabled=field.read(lambda value: value is None, otherwise=KEEP))
+        self.bindings.properties(slider.handle, disabled=self.read(lambda value: value is None, otherwise=KEEP))
 
-
-def _add_switch(gui: viser.GuiApi, field: _SettingField, setting: Switch, order: float | None) -> None:
-    handle = gui.add_checkbox(setting.label, False, order=order, visible=False, hint=setting.hint)
-    field.bind(handle, bool, lambda _before, on: on)
-
-
-def _add_choice(gui: viser.GuiApi, field: _SettingField, setting: Choice, order: float | None) -> None:
-    keys = {label: key for key, label in setting.options.items()}
-    handle = gui.add_dropdown(setting.label, tuple(keys), order=order, visible=False, hint=setting.hint)
-    field.bind(handle, lambda value: setting.options[value], lambda _before, label: keys[label])
-
-
-def _add_integration(gui: viser.GuiApi, field: _SettingField, _setting: FlowIntegration, order: float | None) -> None:
-    hint = "auto: errors stay invisible; the others take equal steps, and the status warns of their errors"
-    methods = {label: method for method, label in METHOD_LABELS.items()}
-    field.bind(
-        gui.add_dropdown("Integrator", tuple(methods), order=order, visible=False, hint=hint),
-        lambda integration: METHOD_LABELS[integration.method],
-        lambda before, label: replace(before, method=methods[label]),
-    )
-    field.bind(
-        gui.add_slider("Steps", 1, MAX_STEPS, 1, 8, order=order, visible=False),
-        lambda integration: integration.steps,
-        lambda before, steps: replace(before, steps=int(steps)),
-        visible=lambda integration: integration.by_hand,
-    )
-
-
-_BUILDERS: Mapping[type[Setting], Callable[[viser.GuiApi, _SettingField, Any, float | None], None]] = {
-    Number: _add_number,
-    Switch: _add_switch,
-    Choice: _add_choice,
-    FlowIntegration: _add_integration,
-}
+    def _add_integration(self, given: dict[str, Any]) -> None:
+        hint = "auto: errors stay invisible; the others take equal steps, and the status warns of their errors"
+        methods: dict[str, Method] = {"auto": "auto", "RK4": "rk4", "Euler (the paper's)": "euler"}
+        labels = {method: label for label, method in methods.items()}
+        self.bind(
+            self.gui.add_dropdown("Integrator", tuple(methods), hint=hint, **given),
+            lambda integration: labels[integration.method],
+            lambda before, label: replace(before, method=methods[label]),
+        )
+        self.bind(
+            self.gui.add_slider("Steps", 1, MAX_STEPS, 1, 8, **given),
+            lambda integration: integration.steps,
+            lambda before, steps: replace(before, steps=int(steps)),
+            visible=lambda integration: integration.by_hand,
+        )

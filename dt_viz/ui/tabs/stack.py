@@ -1,4 +1,4 @@
-"""The stack of transforms as a list, the outermost on top: each is switched, moved, looked at and tuned."""
+"""The tab "Stack": the transforms as a list, the outermost on top, how far they have run, and their settings."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ import viser
 
 from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.avoidance.hand import Avoidance
-from dt_viz.avoidance.transform import Transform
+from dt_viz.avoidance.transform import Setting, Transform
+from dt_viz.learning.imitation import OBJECTIVES
+from dt_viz.learning.state import STATES
 from dt_viz.scenario.panels import BASE_PANEL
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import (
@@ -24,21 +26,25 @@ from dt_viz.scenario.stack import (
     switched,
     transform_of,
     tunable,
+    tuned,
 )
+from dt_viz.scenario.tasks import STYLES
+from dt_viz.session import player
 from dt_viz.session.frame import Frame
 from dt_viz.session.session import Session
-from dt_viz.ui.panel.bindings import Bindings
-from dt_viz.ui.panel.transform_settings import add_transform_settings
-from dt_viz.ui.panel.warp import WarpControls
+from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.levels import manifold
 from dt_viz.ui.scene.picture import Colour
+from dt_viz.ui.tabs.plots import small
+from dt_viz.ui.tabs.settings import add_settings, settings_of_purpose
 
 BASE = "Base attractor"
-BELOW = 1e9
-"""Order of the controls below the rows in their folder."""
 ON, OFF, UP, DOWN, SHOW, SHOWN = "● on", "○ off", "↑", "↓", "show", "● shown"
-
+WARP, PLAY, STOP = "Warp", "▶ 0 → 1", "Stop"
+SECONDS = 5.0
+"""Duration of playing the warp."""
+NO_STYLE = "–"
 
 _COLOURS: Mapping[type[Transform], Colour] = {Avoidance: palette.OBSTACLE, BiasPoint: palette.BIAS}
 """Colours of kinds of transforms in the formula; those of what is drawn of them."""
@@ -64,17 +70,14 @@ class StackPanel:
         self.rows: list[Any] = []
         self._shown: tuple[StackRow, ...] = ()
         with self._folder:
-            self._warp = WarpControls(gui, bindings, BELOW)
-            add_transform_settings(gui, bindings, BELOW + 2)
+            below = 1e9  # order of the controls below the rows, of which there is any number
+            add_warp(gui, bindings, below)
+            add_transform_settings(gui, bindings, below + 2)
         bindings.show(self._wanted, self._show)
         legend = gui.add_html(
             "", visible=False
         )  # at the end: it appears and disappears, which would move controls below it
         bindings.properties(legend, content=legend_html, visible=lambda s: bool(legend_html(s)))
-
-    def close(self) -> None:
-        """Stop playing."""
-        self._warp.close()
 
     def _wanted(self, scenario: Scenario) -> tuple[StackRow, ...]:
         frame = self._bindings.frame
@@ -105,8 +108,7 @@ class StackPanel:
 
 def press(session: Session, name: str, button: str) -> None:
     """Do what a button of the row of this name does."""
-    session.edit(f"{name} {button}", **_ACTIONS[button](session.scenario, name))
-    session.end_gesture()
+    session.step(f"{name} {button}", **_ACTIONS[button](session.scenario, name))
 
 
 def rows(scenario: Scenario, durations: Mapping[str, float | None]) -> tuple[StackRow, ...]:
@@ -141,11 +143,9 @@ def legend_html(scenario: Scenario) -> str:
     swatch = (
         f"display:inline-block;width:1.6em;height:0.28em;vertical-align:middle;background:{palette.css(palette.LEVEL)}"
     )
-    what = manifold(scenario)
-    return (
-        "<div style='font-size:0.8em;padding:0.1em 0.9em 0.5em;opacity:0.85'>"
-        f"<span style='{swatch}'></span> {html.escape(what)}, without what is stacked on it: rollouts, "
-        "and all that lies on the slice. Pale: rollouts of the whole stack</div>"
+    return small(
+        f"<span style='{swatch}'></span> {html.escape(manifold(scenario))}, without what is stacked on it: rollouts, "
+        "and all that lies on the slice. Pale: rollouts of the whole stack"
     )
 
 
@@ -164,10 +164,8 @@ def formula_html(scenario: Scenario) -> str:
         whole = _part("q", palette.WAY)
         inner, names = f"fk({whole}(q))", [*names, f"{whole} {WHOLE_ARM}"]
     formula = "".join(f"{part}(" for _, part in parts) + inner + ")" * len(parts)
-    return (
-        f"<div style='padding:0.3em 0.9em 0;font-size:1.05em'>z = {formula}</div>"
-        f"<div style='font-size:0.8em;padding:0.1em 0.9em 0.5em'>{' · '.join((f'z {BASE}', *names))}</div>"
-    )
+    legend = small(" · ".join((f"z {BASE}", *names)))
+    return f"<div style='padding:0.3em 0.9em 0;font-size:1.05em'>z = {formula}</div>{legend}"
 
 
 def _index(name: str) -> str:
@@ -207,3 +205,97 @@ _ACTIONS: dict[str, Callable[[Scenario, str], dict[str, Any]]] = {
     SHOW: _select,
     SHOWN: _select,
 }
+
+
+def add_warp(gui: viser.GuiApi, bindings: Bindings, order: float) -> None:
+    """Build the slider of the warp and the button that plays it, from an order in their folder on."""
+    hint = "part of its time that each flow runs. 0: motions and space are straight; 1: the stack is complete"
+    slider = gui.add_slider(WARP, 0.0, 1.0, 0.01, 1.0, order=order, hint=hint)
+    bindings.field(slider, "warp")
+    buttons = gui.add_button_group("Play warp", (PLAY,), order=order + 1)
+
+    def show(playing: bool) -> None:
+        buttons.options = (STOP,) if playing else (PLAY,)
+
+    def press(session: Session, button: str) -> None:
+        if button == STOP:
+            player.stop(session)
+        else:
+            player.start(session, WARP, grown, show)
+
+    bindings.on(buttons, press)
+
+
+def grown(scenario: Scenario, seconds: float) -> dict[str, float] | None:
+    """Return the warp some seconds after playing began; None once it is full."""
+    return None if scenario.warp == 1 and seconds > SECONDS else {"warp": round(min(1.0, seconds / SECONDS), 3)}
+
+
+def add_transform_settings(gui: viser.GuiApi, bindings: Bindings, order: float) -> None:
+    """Build the settings of the transform that is chosen here, or was looked at last, from an order on."""
+    which = gui.add_dropdown("Settings of", (IMITATION,), order=order, hint="the transform that is changed below")
+    bindings.properties(which, options=tunable)
+    bindings.input(which, tuned, lambda s, value: {"view": replace(s.view, tuned=value)})
+    order += 1
+    hint = "what is fitted to the demonstrations: whole motions, or velocities as in eq. (3) of the paper"
+    objective = gui.add_dropdown("Objective", OBJECTIVES, order=order, hint=hint)
+    bindings.field(objective, "objective")
+    hint = (
+        "plain: the paper's, one field that needs no memory. augmented: remembers its phase and where it began, so "
+        "that it crosses itself, comes back, and draws the figure from other starts. auto: plain, unless the "
+        "demonstrations conflict or are missed by it"
+    )
+    state = gui.add_dropdown("State", STATES, order=order, hint=hint)
+    bindings.field(state, "state")
+    hint = "how another hand draws, taken off its demonstrations of one letter and put on this one (augmented)"
+    style = gui.add_dropdown("Style", (NO_STYLE, *STYLES), order=order, hint=hint)
+    bindings.input(style, lambda s: s.style or NO_STYLE, lambda _s, name: {"style": "" if name == NO_STYLE else name})
+    hint = "part of the style that is put on; below 0 it is taken off"
+    amount = gui.add_slider("Amount", -1.0, 2.0, 0.05, 1.0, order=order, hint=hint)
+    bindings.field(amount, "style_amount")
+    bindings.properties(style, visible=lambda s: _is_imitation(s) and _is_drawing(bindings.frame))
+    bindings.properties(amount, visible=lambda s: _is_imitation(s) and bool(s.style))
+    note = gui.add_html("", order=order)
+    bindings.properties(note, content=lambda _s: learned_html(bindings.frame))
+    for handle in (objective, state, note):
+        bindings.properties(handle, visible=_is_imitation)
+    add_settings(gui, bindings, _settings, tuned, order)
+
+
+def _is_drawing(frame: Frame | None) -> bool:
+    return frame is not None and frame.task.draws
+
+
+def _is_imitation(scenario: Scenario) -> bool:
+    return tuned(scenario) == IMITATION
+
+
+def _settings(kind: type[Transform]) -> tuple[Setting, ...]:
+    """Return the settings of a kind in the stack: those of its flow; all of one that is not added on the page."""
+    others = () if kind.most == 1 else settings_of_purpose(kind)
+    return tuple(setting for setting in kind.settings if setting not in others)
+
+
+def learned_html(frame: Frame | None) -> str:
+    """Return a note about what was learned: in which state and why, and of how many steps the flows are."""
+    steps = () if frame is None else frame.learned_steps
+    if frame is not None and frame.remembers:
+        why = f"Chosen because {frame.reason}. " if frame.reason else ""
+        text = (
+            f"{why}Augmented: each motion remembers its phase and where it began, and follows what is predicted for "
+            "them. Space is shifted along that prediction, not bent by flows (det J = 1): there are no steps to choose."
+        )
+        if frame.labels:
+            text += (
+                f" The demonstrations show {len(set(frame.labels))} patterns that begin at about the same place. A "
+                "number, their label, tells them apart: World → Starts → Label chooses it for starts that you add."
+            )
+    elif steps:
+        flows = f"{len(steps)} flows" if len(steps) > 1 else "One flow"
+        text = (
+            f"{flows} of {max(steps)} Euler steps, t = 1, with an exact inverse. The steps are part of what was "
+            "learned: other ones would be another motion, so there is nothing to choose."
+        )
+    else:
+        text = "Off: motions are straight."
+    return small(html.escape(text))

@@ -1,0 +1,109 @@
+"""Work of one visitor beside the server's event loop, in lanes: one thing at a time in each."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable
+
+from dt_viz.errors import UnwantedError
+
+logger = logging.getLogger(__name__)
+
+Work = Callable[[], None]
+
+
+class Jobs:
+    """Executor of one visitor. A lane has a thread while it has work, so lanes wait for nobody else.
+
+    Running work is never cancelled from outside (that would show nothing until a drag ends); it may ask `superseded`
+    between its parts and leave out the rest. What was submitted last to a lane is always done.
+    """
+
+    def __init__(self, fail: Callable[[Exception], None]) -> None:
+        """Wait for work; `fail` is told of the exceptions that it raises, unless the visitor has left."""
+        self._fail = fail
+        self._changed = threading.Condition()
+        self._lanes: dict[str, deque[Work]] = {}
+        """Work that waits, of each lane that has a thread."""
+        self._closed = False
+
+    def submit(self, lane: str, work: Work, *, latest: bool = False) -> int:
+        """Do work on a lane, after what it is doing; nothing is done once the visitor has left. Never blocks for long.
+
+        Args:
+            lane: name of the lane.
+            work: does it.
+            latest: whether to drop what waits on the lane, instead of doing that first.
+
+        Returns:
+            Number of the works that were dropped.
+        """
+        with self._changed:
+            if self._closed:  # a control that still moves while its page goes away
+                return 0
+            dropped = self._drop(lane) if latest else 0
+            if lane in self._lanes:
+                self._lanes[lane].append(work)
+            else:
+                self._lanes[lane] = deque([work])
+                threading.Thread(target=self._run, args=(lane,), name=lane, daemon=True).start()
+            self._changed.notify_all()
+            return dropped
+
+    def busy(self, lane: str) -> bool:
+        """Return whether a lane works."""
+        return lane in self._lanes
+
+    def superseded(self, lane: str) -> bool:
+        """Return whether newer work waits on a lane, or the visitor has left."""
+        return self._closed or bool(self._lanes.get(lane))
+
+    def rest(self, lane: str, seconds: float) -> None:
+        """Pause the work of a lane, which calls this, for so long or until it is superseded."""
+        with self._changed:
+            self._changed.wait_for(lambda: self.superseded(lane), seconds)
+
+    def wait_idle(self, lane: str | None = None, timeout: float | None = None) -> bool:
+        """Wait until a lane, or each, has nothing to do; False if that took longer than `timeout` seconds."""
+        with self._changed:
+            return self._changed.wait_for(lambda: not (self.busy(lane) if lane else self._lanes), timeout)
+
+    def close(self) -> None:
+        """Drop what waits: the visitor has left. What runs is not waited for."""
+        with self._changed:
+            self._closed = True
+            for lane in self._lanes:
+                self._drop(lane)
+            self._changed.notify_all()
+
+    def _drop(self, lane: str) -> int:
+        waiting = self._lanes.get(lane, deque())
+        dropped = len(waiting)
+        waiting.clear()
+        return dropped
+
+    def _run(self, lane: str) -> None:
+        while True:
+            with self._changed:
+                waiting = self._lanes[lane]
+                if not waiting:
+                    del self._lanes[lane]
+                    self._changed.notify_all()
+                    return
+                work = waiting.popleft()
+            try:
+                work()
+            except UnwantedError:
+                pass
+            except Exception as error:  # the one place where whatever work raises is caught: the page goes on
+                if not self._closed:
+                    logger.exception("%s failed", lane)
+                    self._report(lane, error)
+
+    def _report(self, lane: str, error: Exception) -> None:
+        try:
+            self._fail(error)
+        except Exception:  # the page that is to show it may be what broke
+            logger.exception("an error of %s could not be shown", lane)

@@ -1,0 +1,231 @@
+"""The control panel: task and scene, the status, the tabs, commands and the foot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import viser
+
+from dt_viz.avoidance.hand import Space
+from dt_viz.robot.robot import Robot
+from dt_viz.scenario.paper_scenes import SCENES, PaperScene, offered
+from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.stack import avoidance_layer, avoiding_with
+from dt_viz.scenario.tasks import Task
+from dt_viz.session.frame import Frame
+from dt_viz.session.progress import Message, Progress
+from dt_viz.session.session import Session
+from dt_viz.ui.bindings import Bindings
+from dt_viz.ui.scene.legend import Legend
+from dt_viz.ui.scene.picture import Colour
+from dt_viz.ui.scene.tripod import Tripod
+from dt_viz.ui.tabs.about import Command, add_about, add_commands, numbered
+from dt_viz.ui.tabs.arm import add_arm, play_or_pause
+from dt_viz.ui.tabs.compare import ComparePanel
+from dt_viz.ui.tabs.picture import BigType, PictureTab, Presentation
+from dt_viz.ui.tabs.show import ShowTab
+from dt_viz.ui.tabs.stack import StackPanel
+from dt_viz.ui.tabs.status import COLOURS, StatusLine, hint, hint_html, sentence
+from dt_viz.ui.tabs.world import add_obstacles, add_starts, add_transforms
+
+LANE = "task"
+"""Lane of the session's jobs on which the task or scene that was chosen last is read."""
+NO_SCENE = "–"
+OFF = "Off"
+SPACES: Mapping[str, Space] = {"Hand": "task", "Arm": "cspace"}
+"""Spaces of the avoidance, by their names on the page."""
+
+
+class ControlPanel:
+    """The control panel of one visitor."""
+
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        titles: Mapping[str, str],
+        robot: Robot,
+        save_png: Callable[[str, bool], None],
+        notify: Callable[[str, Colour], None],
+        tripod: Tripod,
+        darken: Callable[[bool], None],
+    ) -> None:
+        """Build the controls; they act once `connect` has given them a session.
+
+        Args:
+            gui: controls of the visitor.
+            titles: titles of the tasks, by name.
+            robot: robot whose joints are plotted.
+            save_png: makes a picture, given the resolution's name and whether it is transparent.
+            notify: shows a text in a colour beside the panel, however far that is scrolled.
+            tripod: stand of the visitor's camera.
+            darken: begins the dark theme, or the light one.
+        """
+        self._notify, self._tripod, self._titles = notify, tripod, dict(titles)
+        self._notified: Message | None = None
+        self._scenes = {scene.title: scene for scene in offered(self._titles)}
+        self.bindings = bindings = Bindings()
+        self.presentation = Presentation(gui, self._turn, partial(setattr, tripod, "alone"))
+        bindings.show(self._title, self.presentation.entitle)
+        big = BigType(gui, tripod)
+        self._add_choices(gui)
+        self.hint = gui.add_html(hint_html(""))
+        add_avoid_and_imitate(gui, bindings)
+        self.status = StatusLine(gui, bindings)
+        bindings.on(gui.add_button_group("History", ("Undo", "Redo", "Reset")), self._travel)
+        gui.add_html("<style>[data-dock-tab] { padding: 0 0.45em !important }</style>")  # all tabs lie in one row
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("World"):
+            add_obstacles(gui, bindings)
+            add_transforms(gui, bindings)
+            add_starts(gui, bindings)
+        with tabs.add_tab("Stack"):
+            StackPanel(gui, bindings)
+        with tabs.add_tab("Show"):
+            self.show = ShowTab(gui, bindings, robot)
+        with tabs.add_tab("Arm"):
+            self.push = add_arm(gui, bindings)
+        with tabs.add_tab("Compare"):
+            self._compare = ComparePanel(gui, bindings)
+        with tabs.add_tab("Picture"):
+            act = {"darken": darken, "enlarge": big.show, "save_png": save_png}
+            picture = PictureTab(gui, bindings, tripod, self.presentation, **act)
+        commands = self._commands(gui.main_panel, picture)
+        add_commands(gui, bindings, commands)
+        add_about(gui, commands)
+
+    def connect(self, session: Session) -> None:
+        """Let the controls edit this session."""
+        self.bindings.connect(session)
+
+    @property
+    def legend(self) -> Legend | None:
+        """Legend of the colours on the slice."""
+        return self.show.slice.legend
+
+    def adopt(self, scenario: Scenario) -> None:
+        """Show the scenario's choices."""
+        self.bindings.adopt(scenario)
+
+    def report(self, frame: Frame) -> None:
+        """Show what a frame tells, unless another task or scene was chosen meanwhile."""
+        wanted = self.bindings.scenario
+        if wanted is None or frame.scenario.begins_like(wanted):
+            self.bindings.report(frame)
+            self.show.draw(frame)
+            self._compare.draw(frame.comparison)
+
+    def tell(self, progress: Progress) -> None:
+        """Show the verdict on what is shown, its hint, and a message, which is for a while beside the panel, too."""
+        self.status.tell(progress)
+        self.give_hint("" if progress.shown is None or progress.stale else hint(progress.shown))
+        message = progress.message
+        if message is not None and message is not self._notified:
+            self._notify(sentence(message.text), COLOURS[message.severity][0])
+        self._notified = message
+
+    def give_hint(self, text: str) -> None:
+        """Show a hint in the panel, and as the caption of the presentation."""
+        self.hint.content = hint_html(text)
+        self.presentation.caption(text)
+
+    def _add_choices(self, gui: viser.GuiApi) -> None:
+        names = {title: name for name, title in self._titles.items()}
+        self.bindings.choice(
+            gui.add_dropdown("Task", tuple(names), hint="what is learned from demonstrations"),
+            lambda s: self._titles[s.task],
+            partial(self.begin, lambda session, title: session.choose_task(names[title])),
+        )
+        self.bindings.choice(
+            gui.add_dropdown("Scene", (NO_SCENE, *self._scenes), hint="scenes of the paper's figures"),
+            lambda s: SCENES[s.scene].title if s.scene in SCENES else NO_SCENE,
+            partial(self.begin, self._load),
+        )
+
+    def _title(self, scenario: Scenario) -> str:
+        return SCENES[scenario.scene].title if scenario.scene in SCENES else self._titles[scenario.task]
+
+    def _turn(self, step: int) -> None:
+        """Go to a scene so many places after the shown one; before the first is the last."""
+        scenario, titles = self.bindings.scenario, tuple(self._scenes)
+        if scenario is not None:
+            shown = titles.index(self._title(scenario)) if scenario.scene in SCENES else min(-step, 0)
+            self.begin(self._load, self.bindings.session, titles[(shown + step) % len(titles)])
+
+    def _load(self, session: Session, title: str) -> None:
+        if title == NO_SCENE:
+            session.leave_scene()
+        else:
+            session.load(self._scenes[title].task, prepared(self._scenes[title]))
+
+    def begin(self, begin: Callable[[Session, str], None], session: Session, title: str) -> None:
+        """Begin a task or a scene beside the server's event loop; if that fails, show why and stay."""
+
+        def work() -> None:
+            session.expect(True)
+            try:
+                begin(session, title)
+            except Exception:
+                self.bindings.restore()
+                raise
+            finally:
+                session.expect(False)
+
+        session.expect(True)
+        session.jobs.submit(LANE, work, latest=True)
+
+    def _commands(self, panel: Any, picture: PictureTab) -> list[Command]:  # noqa: ANN401 - viser's, without a name
+        folded = False  # a visitor may unfold it by hand, which nobody is told of
+
+        def fold(_session: Session) -> None:
+            nonlocal folded
+            if not self.presentation.on:  # its caption would go, too
+                folded = not folded
+                (panel.minimize if folded else panel.expand)()
+
+        return [
+            Command("Pause, or play", play_or_pause, "space"),
+            Command("Reset the scene and the camera", lambda session: self._travel(session, "Reset"), "R"),
+            Command("Undo", lambda session: self._travel(session, "Undo"), "Z"),
+            Command("Redo", lambda session: self._travel(session, "Redo"), "Z", shifted=True),
+            *picture.commands,
+            Command("Hide the panel, or show it", fold, "H"),
+            *self.presentation.commands,
+            *numbered(tuple(self._scenes), partial(self.begin, self._load)),
+        ]
+
+    def _travel(self, session: Session, button: str) -> None:
+        {"Undo": session.undo, "Redo": session.redo, "Reset": session.reset}[button]()
+        if button == "Reset":
+            self._tripod.view()
+
+
+def add_avoid_and_imitate(gui: viser.GuiApi, bindings: Bindings) -> None:
+    """Build the dropdown "Avoid" and the checkbox "Imitate" where the panel is being built."""
+    hint = "what gives way to the obstacles. Hand: the path of the hand, and the arm follows it. Arm: the whole arm"
+    bindings.input(
+        gui.add_dropdown("Avoid", (OFF, *SPACES), hint=hint),
+        avoids_with,
+        lambda s, name: {"stack": avoiding_with(s, SPACES.get(name))},
+    )
+    hint = "off: without what was learned, every motion is straight to the goal, and still avoids"
+    bindings.field(gui.add_checkbox("Imitate", True, hint=hint), "imitation")
+
+
+def avoids_with(scenario: Scenario) -> str:
+    """Name of what avoids the page's obstacles."""
+    layer = avoidance_layer(scenario)
+    return ("Hand" if scenario.arm_avoidance is None else "Arm") if layer.on else OFF
+
+
+def prepared(scene: PaperScene) -> Callable[[Task], Scenario]:
+    """Return a function that makes the scene's scenario, with the surfaces of its obstacles, which take seconds."""
+
+    def scenario(task: Task) -> Scenario:
+        begun = scene.scenario(task)
+        for obstacle in begun.obstacles:
+            obstacle.surface()
+        return begun
+
+    return scenario

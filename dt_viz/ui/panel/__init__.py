@@ -1,1 +1,0 @@
-"""The controls and the status."""

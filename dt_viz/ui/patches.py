@@ -1,0 +1,110 @@
+"""What is used of viser and websockets beyond what they document, and changed in them; nothing else does either.
+
+Each function names the public hook that would replace it. What it needs is checked when the server starts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import viser
+import viser._messages
+import viser._scene_api
+import viser._viser
+import websockets.asyncio.server
+
+Options = Callable[[Any, dict[str, Any]], tuple[Any, dict[str, Any]]]
+"""Function of a handler of connections and of options of `websockets.serve`, which returns others."""
+
+
+class GateError(RuntimeError):
+    """A version of viser whose internals differ from what is relied on."""
+
+    def __init__(self, what: str) -> None:
+        super().__init__(f"viser {viser.__version__} has changed ({what}); accepted: viser 1.1")
+
+
+def declared(name: str) -> type:
+    """Return the dataclass of a kind of messages; AttributeError if there is none. Hook: a public list of them."""
+    return getattr(viser._messages, name)
+
+
+def open_server(options: Options, **arguments: Any) -> viser.ViserServer:  # noqa: ANN401
+    """Start a server of viser. Hook: options of `ViserServer` that are passed on to `websockets.serve`.
+
+    Args:
+        options: function of viser's handler of connections and of its options for `websockets.serve`; it returns
+            those that are used instead.
+        **arguments: those of `viser.ViserServer`.
+
+    Raises:
+        GateError: viser does not start its server as expected.
+    """
+    module: Any = websockets.asyncio.server
+    original, used = module.serve, []
+
+    def serve(handler: Any, *where: Any, **given: Any) -> Any:  # noqa: ANN401
+        used.append(True)
+        handler, given = options(handler, given)
+        return original(handler, *where, **given)
+
+    module.serve = serve
+    try:
+        server = viser.ViserServer(**arguments)
+    finally:
+        module.serve = original
+    connections = getattr(getattr(server, "_websock_server", None), "_live_connections", None)
+    if not used or not isinstance(connections, dict):
+        server.stop()
+        raise GateError("its server" if not used else "its connections")
+    return server
+
+
+def report_failures(report: Callable[[BaseException], None]) -> None:
+    """Have `report` called with what viser's callbacks raise, which it would print. Hook: `on_callback_error`."""
+
+    def report_task(task: Any) -> None:  # noqa: ANN401 - a future, or a task
+        if not task.cancelled() and task.exception() is not None:
+            report(task.exception())
+
+    reports = {
+        "print_threadpool_errors": report_task,
+        "print_task_error": report_task,
+        "print_awaited_callback_error": report,
+    }
+    for module in (viser._gui_api, viser._scene_api, viser._viser):
+        for name in reports.keys() & vars(module):
+            setattr(module, name, reports[name])
+
+
+def client_of(server: viser.ViserServer, connection: Any) -> viser.ClientHandle | None:  # noqa: ANN401
+    """Return the client of a connection; None before its page has told a camera. Hook: `ClientHandle.connection`."""
+    live = server._websock_server._live_connections
+    ids = [client_id for client_id, other in live.items() if other is connection]
+    return server.get_clients().get(ids[0]) if ids else None
+
+
+def drop_uploads(client: viser.ClientHandle) -> None:
+    """Let go of files that a client has not sent to the end. Hook: a limit of uploads that are under way."""
+    client.gui._drop_uploads_from_client(client._websock_connection.client_id)  # pyright: ignore[reportArgumentType]
+
+
+def refuse_upload(client: viser.ClientHandle, message: Any) -> None:  # noqa: ANN401 - FileTransferStartUpload
+    """Have the page end an upload, which it shows until all of it is acknowledged. Hook: an upload that is refused."""
+    size = message.size_bytes
+    for told in (
+        viser._messages.FileTransferPartAck(message.source_component_uuid, message.transfer_uuid, size, size),
+        viser._messages.RemoveNotificationMessage(f"upload-{message.transfer_uuid}"),
+    ):
+        client._websock_connection.queue_message(told)
+
+
+def put_back(handle: Any, value: Any, *, shown: bool) -> None:  # noqa: ANN401
+    """Assign the value of a control, and show it in the browser if `shown`. Hook: a setter that calls nothing back.
+
+    viser's own casts to the type of the browser's claim, and calls back on a loop that may have ended.
+    """
+    handle._impl.value = value
+    if shown:
+        handle._queue_update("value", value)

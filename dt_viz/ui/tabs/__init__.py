@@ -1,0 +1,1 @@
+"""The tabs of the panel, one file for each, and what they share."""

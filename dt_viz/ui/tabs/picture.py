@@ -1,0 +1,193 @@
+"""The tab "Picture": how the scene is looked at, saved and presented."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Callable
+from functools import partial
+
+import viser
+
+from dt_viz.session.session import Session
+from dt_viz.ui.bindings import Bindings
+from dt_viz.ui.controls import Control, on_press, switch
+from dt_viz.ui.scene.camera import HAND, HOME, PANEL, VIEWS
+from dt_viz.ui.scene.export import RESOLUTIONS
+from dt_viz.ui.scene.tripod import Tripod
+from dt_viz.ui.tabs.about import Command
+
+LARGER = 1.4
+"""Factor by which the panel, its type and its controls are larger for a projector."""
+LANE = "picture"
+"""Lane of the session's jobs on which one picture is made: a browser may take a minute to render, or never answer."""
+ROW = (
+    "<style>div:has(> .dt-row) + div > div > :first-child { width: auto !important; }</style><div class='dt-row'></div>"
+)
+"""Mark and style of a group of buttons that needs the room beside its label to lie in one row."""
+BACK, ON, END = "Previous", "Next", "End"
+ALONE = """<style>
+.mantine-Paper-root:has(.dt-caption) { visibility: hidden; }
+.dt-caption, div:has(> .dt-caption) + div { visibility: visible; position: fixed; bottom: 0; box-sizing: border-box; }
+.dt-caption {
+    left: 0; right: 0; padding: 2.2em 13em 1.2em 2.4em; pointer-events: none; color: var(--mantine-color-text);
+    background: linear-gradient(to top, var(--mantine-color-body) 35%, transparent);
+}
+.dt-caption h1 { margin: 0; font-size: clamp(1.5rem, 3.2vw, 4rem); line-height: 1.2; font-weight: 650; }
+.dt-caption p { margin: 0.2em 0 0; font-size: clamp(1rem, 1.7vw, 2.2rem); line-height: 1.3; }
+div:has(> .dt-caption) + div { right: 1em; width: 11.5em; padding: 0 0 1em; }
+div:has(> .dt-caption) + div label { display: none; }
+div:has(> .dt-caption) + div > div > :first-child { display: none; }
+@media (max-width: 700px) { .dt-caption { padding: 1.6em 1.2em 3.4em; } }
+</style>"""
+"""Style that hides the panel around the caption, and puts that and the buttons after it at the foot of the window."""
+
+
+class PictureTab:
+    """The controls of one visitor's camera, theme and size of type, pictures and presentation."""
+
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        bindings: Bindings,
+        tripod: Tripod,
+        presentation: Presentation,
+        *,
+        darken: Callable[[bool], None],
+        enlarge: Callable[[bool], None],
+        save_png: Callable[[str, bool], None],
+    ) -> None:
+        """Build the controls where the panel is being built.
+
+        Args:
+            gui: controls of the visitor.
+            bindings: bindings of the visitor's panel.
+            tripod: stand of the visitor's camera.
+            presentation: the visitor's presentation.
+            darken: takes whether the theme is the dark one.
+            enlarge: takes whether the type is large.
+            save_png: makes a picture, given the resolution's name and whether it is transparent.
+        """
+        self._tripod = tripod
+        gui.add_html(ROW)
+        Control(gui.add_button_group("View", (*VIEWS, HAND, HOME)), tripod.view)
+
+        def box(label: str, hint: str) -> viser.GuiCheckboxHandle:
+            return gui.add_checkbox(label, False, hint=hint)
+
+        orbit = box("Orbit", "turns slowly around what is shown; where you move the camera, it goes on from there")
+        self._orbit = Control(orbit, partial(setattr, tripod, "orbits"))
+        lock = box("Lock camera", "no drag, wheel or key moves the camera; its views, the orbit and another scene do")
+        self._lock = Control(lock, partial(setattr, tripod, "locked"))
+        dark = box("Dark theme", "for a dark room; pictures that are saved stay light")
+        self._dark = bindings.later(dark, lambda _session, on: darken(on))
+        big = box("Big type", "larger type and controls in a wider panel, to be read from afar")
+        self._big = Control(big, enlarge)
+        on_press(gui.add_button("Presentation", icon=viser.Icon.PRESENTATION), lambda: presentation.show(True))
+        self._resolution = Control(gui.add_dropdown("Resolution", tuple(RESOLUTIONS)))
+        self._transparent = Control(gui.add_checkbox("Transparent", False))
+        self._save, self._save_png = gui.add_button("Save PNG", icon=viser.Icon.CAMERA), save_png
+        bindings.on(self._save, self._request)
+
+    @property
+    def commands(self) -> list[Command]:
+        """What the controls do; Home, which frames all again, comes first."""
+        views = [Command(f"View: {name}", lambda _, name=name: self._tripod.view(name)) for name in (*VIEWS, HAND)]
+        return [
+            Command("Frame: move the camera back", lambda _: self._tripod.view(), "F"),
+            *views,
+            Command("Orbit: turn the camera slowly, or stop", lambda _: switch(self._orbit), "O"),
+            Command("Lock the camera, or let it go", lambda _: switch(self._lock), "L"),
+            Command("Theme: dark, or light", lambda _: switch(self._dark), "T"),
+            Command("Big type for a projector, or the usual one", lambda _: switch(self._big), "B"),
+        ]
+
+    def _request(self, session: Session, _pressed: bool) -> None:
+        """Begin a picture unless one is being made."""
+        if not session.jobs.busy(LANE):
+            session.jobs.submit(LANE, partial(self._make, self._resolution.value, self._transparent.value))
+
+    def _make(self, resolution: str, transparent: bool) -> None:
+        self._save.disabled = True
+        try:
+            self._save_png(resolution, transparent)
+        finally:
+            self._save.disabled = False
+
+
+class BigType:
+    """Size of the type of one visitor's page, and width of the panel."""
+
+    def __init__(self, gui: viser.GuiApi, tripod: Tripod) -> None:
+        """Begin with the usual size; must be built outside tabs and folders, of which closed ones have no style."""
+        # viser measures its page in rem or em, of 92.5 % of the browser's type; on a phone the panel fills the window
+        style = f"<style>@media (min-width: 577px) {{ :root {{ font-size: {92.5 * LARGER}%; }} }}</style>"
+        self._style, self._panel, self._tripod = gui.add_html(style, visible=False), gui.main_panel, tripod
+
+    def show(self, on: bool) -> None:
+        """Show large type, or the usual one, and frame the scene beside the wider panel."""
+        usual = 320.0  # of viser's panel, CSS pixels
+        wider = (LARGER - 1) * usual if on else 0.0
+        self._style.visible = on
+        self._panel.set_width(usual + wider)
+        self._tripod.panel = PANEL + wider
+
+
+class Presentation:
+    """Title and caption of what is shown, in place of the panel while it is on."""
+
+    def __init__(self, gui: viser.GuiApi, turn: Callable[[int], None], present: Callable[[bool], None]) -> None:
+        """Build its controls where the panel is being built, hidden.
+
+        Args:
+            gui: controls of the visitor.
+            turn: goes so many scenes on, or back; must only submit.
+            present: called when the presentation begins, and when it ends.
+        """
+        self._panel, self._turn, self._present = gui.main_panel, turn, present
+        self._title = self._caption = ""
+        self._html = gui.add_html("", visible=False)
+        self._buttons = gui.add_button_group("Presentation", (BACK, ON, END), visible=False)
+        Control(self._buttons, self._press)
+
+    @property
+    def on(self) -> bool:
+        """Whether the panel is hidden, and the caption shown."""
+        return self._html.visible
+
+    @property
+    def commands(self) -> list[Command]:
+        """Begin and end it; the scenes can be turned with the panel, too."""
+        return [
+            Command("Presentation: the scene without the panel, or with it", lambda _: self.show(not self.on), "P"),
+            Command("End the presentation", lambda _: self.show(False), "escape"),
+            Command("Next scene", lambda _: self._turn(1), "pagedown"),
+            Command("Previous scene", lambda _: self._turn(-1), "pageup"),
+        ]
+
+    def show(self, on: bool) -> None:
+        """Begin it, or end it."""
+        if on != self.on:
+            if on:
+                self._panel.expand()  # what is folded away has no caption either
+            self._html.visible = self._buttons.visible = on
+            self._present(on)
+
+    def entitle(self, title: str) -> None:
+        """Take the title of what is shown."""
+        self._title = title
+        self._write()
+
+    def caption(self, text: str) -> None:
+        """Take the line that says what to see."""
+        self._caption = text
+        self._write()
+
+    def _write(self) -> None:
+        title, caption = html.escape(self._title), html.escape(self._caption)
+        self._html.content = f"{ALONE}<div class='dt-caption'><h1>{title}</h1><p>{caption}</p></div>"
+
+    def _press(self, button: str) -> None:
+        if button == END:
+            self.show(False)
+        else:
+            self._turn(1 if button == ON else -1)

@@ -1,0 +1,137 @@
+"""The tab "Show": the slice and its colours, the plots, and what is drawn in the scene."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import viser
+
+from dt_viz.robot.robot import Robot
+from dt_viz.scenario.scenario import OFFERS, SLICE_COLOURS, Scenario, SliceColour
+from dt_viz.scenario.stack import side_by_side
+from dt_viz.session.frame import Frame
+from dt_viz.session.session import Session
+from dt_viz.ui.bindings import KEEP, Bindings
+from dt_viz.ui.scene.legend import OCCUPANCY, Legend, legend_of
+from dt_viz.ui.tabs.plots import HealthPlots, JointPlots, small
+
+COLOUR_LABELS: Mapping[SliceColour, str] = {
+    "none": "None",
+    "det": "det J",
+    "lyapunov": "Lyapunov value",
+    "occupancy": "Learned occupancy",
+}
+assert set(COLOUR_LABELS) == set(SLICE_COLOURS)
+WHOLE_ARM_NOTE = "The slice shows the stack of the hand's path; what the whole arm avoids with is not in it."
+IN_SCENE = (
+    "rollouts",
+    "ghost",
+    "demonstrations",
+    "field",
+    "streamlines",
+    "arm",
+    "ghost_arm",
+    "onion",
+    "body_points",
+    "table",
+    "grid",
+    "panels",
+    "generator",
+)
+"""Fields of `View` that show and hide what is drawn in the scene, in the order of their checkboxes."""
+
+
+class ShowTab:
+    """The controls of one visitor's tab."""
+
+    def __init__(self, gui: viser.GuiApi, bindings: Bindings, robot: Robot) -> None:
+        """Build the controls where the panel is being built; the plots are those of a robot's joints."""
+        self.slice = SlicePanel(gui, bindings)
+        # each plot under its checkbox, high up in the tab, to be seen when it opens
+        bindings.checkbox(gui, "joint_plots")
+        self.joints = JointPlots(gui, robot)
+        bindings.properties(self.joints, visible=lambda s: s.view.joint_plots)
+        bindings.checkbox(gui, "health_plots")
+        self.health = HealthPlots(gui)
+        bindings.properties(self.health, visible=lambda s: s.view.health_plots)
+        for name in IN_SCENE:
+            if name == "panels":
+                box = gui.add_checkbox(OFFERS[name].label, False, hint=OFFERS[name].hint)
+                bindings.input(box, lambda s: bool(s.view.panels), _with_panels)
+            else:
+                bindings.checkbox(gui, name)
+        # up to three flows, until a picture of the generator says how many there are
+        flow = bindings.slider(gui, "generator_layer", 0, 3, 1, visible=False)
+        bindings.properties(flow, visible=lambda s: s.view.generator, max=lambda _s: _num_flows(bindings.frame))
+
+    def draw(self, frame: Frame) -> None:
+        """Show a frame in the plots."""
+        self.joints.follow(frame.arm)
+        self.health.draw(frame.profiles)
+
+
+class SlicePanel:
+    """The controls of the slice, with a legend of its colours."""
+
+    def __init__(self, gui: viser.GuiApi, bindings: Bindings) -> None:
+        """Build the controls where the panel is being built."""
+        self._bindings = bindings
+        bindings.checkbox(gui, "move_slice")
+        self.back = gui.add_button("Back to the task's slice", visible=False)
+        bindings.properties(self.back, visible=lambda s: s.view.slice is not None)
+        bindings.on(self.back, _put_back)
+        names = {label: name for name, label in COLOUR_LABELS.items()}
+        colour = gui.add_dropdown("Slice colour", tuple(names), hint="quantity shown as colour on the slice")
+        bindings.view(colour, "colour", COLOUR_LABELS.__getitem__, names.__getitem__)
+        phase = bindings.slider(gui, "phase", 0.0, 1.0, 0.01, visible=False)
+        take = gui.add_button("Take the arm's phase", visible=False)
+        bindings.on(take, lambda session, _pressed: session.take_phase())
+        for handle in (phase, take):
+            bindings.properties(
+                handle,
+                visible=lambda _s: bindings.frame is not None and bindings.frame.remembers,
+                disabled=lambda s: not _shows_velocities(s),
+            )
+        self.legend: Legend | None = None
+        """Legend of the colours that are shown."""
+        self.key = gui.add_html("", visible=False)
+        bindings.show(self._legend_of, self._explain)
+        self.note = gui.add_html(small(WHOLE_ARM_NOTE), visible=False)
+        bindings.properties(self.note, visible=_lacks_whole_arm)
+
+    def _legend_of(self, scenario: Scenario) -> Legend | None:
+        """Return the legend of the view's colours; `KEEP` until their picture is there."""
+        colour, frame = scenario.view.colour, self._bindings.frame
+        if colour in {"none", "occupancy"}:
+            return OCCUPANCY if colour == "occupancy" else None
+        picture = None if frame is None else frame.pictures.colour
+        return legend_of(picture) if picture is not None and picture.what == colour else KEEP
+
+    def _explain(self, legend: Legend | None) -> None:
+        self.legend = legend
+        self.key.content, self.key.visible = legend.html if legend else "", legend is not None
+
+
+def _put_back(session: Session, _pressed: bool) -> None:
+    session.step("slice", view=replace(session.scenario.view, slice=None))
+
+
+def _with_panels(scenario: Scenario, shown: bool) -> dict[str, object]:
+    return {"view": replace(scenario.view, panels=side_by_side(scenario) if shown else ())}
+
+
+def _num_flows(frame: Frame | None) -> int:
+    picture = None if frame is None else frame.pictures.generator
+    return KEEP if picture is None else picture.num_flows
+
+
+def _shows_velocities(scenario: Scenario) -> bool:
+    """Whether the slice shows something of the vector field or of ψ."""
+    view = scenario.view
+    return view.colour != "none" or view.field or view.streamlines or view.grid
+
+
+def _lacks_whole_arm(scenario: Scenario) -> bool:
+    """Whether the slice shows something that the whole arm's avoidance would change."""
+    return _shows_velocities(scenario) and scenario.arm_avoidance is not None and bool(scenario.obstacles)

@@ -1,0 +1,194 @@
+"""Work in lanes: one thing at a time in each, the newest or in turn, and no exception ends a lane."""
+
+import logging
+import threading
+
+import numpy as np
+import pytest
+
+from dt_viz.errors import UnwantedError
+from dt_viz.session.jobs import Jobs
+
+PATIENCE = 30.0  # seconds until a hanging test fails; nothing here takes long
+LANE = "lane"
+
+
+class Gate:
+    """Work that tells when it has begun and waits until it is let go."""
+
+    def __init__(self):
+        self.begun, self.go = threading.Event(), threading.Event()
+
+    def __call__(self):
+        self.begun.set()
+        assert self.go.wait(PATIENCE)
+
+
+class Started(Jobs):
+    """Jobs that note what they have done, and what failed."""
+
+    def __init__(self):
+        self.done, self.errors = [], []
+        super().__init__(self.errors.append)
+
+    def note(self, value, lane=LANE, *, latest=True):
+        return self.submit(lane, lambda: self.done.append(value), latest=latest)
+
+    def begin(self, gate, lane=LANE):
+        self.submit(lane, gate)
+        assert gate.begun.wait(PATIENCE)
+
+    def settle(self):
+        assert self.wait_idle(timeout=PATIENCE)
+
+
+@pytest.fixture
+def jobs():
+    jobs = Started()
+    yield jobs
+    jobs.close()
+    jobs.settle()
+
+
+@pytest.mark.parametrize("latest", [True, False])
+def test_waiting_work_is_overtaken_by_the_latest_or_done_in_turn(jobs, latest):
+    gate = Gate()
+    jobs.begin(gate)
+    assert jobs.busy(LANE) and not jobs.wait_idle(LANE, 0.01)
+    dropped = [jobs.note(value, latest=latest) for value in range(10)]
+    gate.go.set()
+    jobs.settle()
+    assert jobs.done == ([9] if latest else [*range(10)])
+    assert sum(dropped) == (9 if latest else 0) and not jobs.busy(LANE)
+
+
+def test_a_lane_waits_for_no_other(jobs):
+    gate = Gate()
+    jobs.begin(gate)
+    jobs.note("other", "other")
+    assert jobs.wait_idle("other", PATIENCE) and jobs.done == ["other"]
+    gate.go.set()
+
+
+def test_running_work_is_not_cancelled_but_told(jobs):
+    gate, seen = Gate(), []
+
+    def work():
+        seen.append(jobs.superseded(LANE))
+        gate()
+        seen.append(jobs.superseded(LANE))
+
+    jobs.submit(LANE, work)
+    assert gate.begun.wait(PATIENCE)
+    jobs.submit(LANE, lambda: seen.append(jobs.superseded(LANE)), latest=True)
+    gate.go.set()
+    jobs.settle()
+    assert seen == [False, True, False]
+
+
+def test_work_runs_one_at_a_time_in_order_and_the_last_is_always_done(jobs):
+    """A storm from several threads; each thread's work carries increasing numbers."""
+    running, dropped = threading.Semaphore(1), []
+
+    def run(value):
+        assert running.acquire(blocking=False), "two at once"
+        jobs.done.append(value)
+        running.release()
+
+    last, lock, pauses = [(0, 0)], threading.Lock(), np.random.default_rng(0).integers(0, 3, (4, 300))
+
+    def storm(thread):
+        for k in range(300):
+            with lock:
+                last[0] = (thread, k)
+                dropped.append(jobs.submit(LANE, lambda k=k: run((thread, k)), latest=True))
+            for _ in range(pauses[thread, k]):
+                threading.Event().wait(0)
+
+    threads = [threading.Thread(target=storm, args=(thread,)) for thread in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(PATIENCE)
+    jobs.settle()
+    assert jobs.errors == []
+    assert jobs.done[-1] == last[0]
+    for thread in range(4):
+        own = [k for t, k in jobs.done if t == thread]
+        assert own == sorted(set(own))
+    assert len(jobs.done) + sum(dropped) == 4 * 300
+
+
+@pytest.mark.parametrize("page_is_gone", [False, True])
+def test_an_exception_is_reported_once_and_survived_even_where_the_report_fails(caplog, page_is_gone):
+    reported, done = [], []
+
+    def report(error):
+        reported.append(str(error))
+        if page_is_gone:
+            raise ConnectionError("the page is gone")
+
+    def fail():
+        raise ValueError("no such thing")
+
+    jobs = Jobs(report)
+    with caplog.at_level(logging.ERROR):
+        jobs.submit(LANE, fail)
+        jobs.submit(LANE, lambda: done.append("next"))
+        assert jobs.wait_idle(LANE, PATIENCE)
+    assert (reported, done) == (["no such thing"], ["next"])
+    assert "Traceback" in caplog.text and "no such thing" in caplog.text
+    assert ("the page is gone" in caplog.text) == page_is_gone
+
+
+def test_what_is_not_wanted_any_more_is_no_error_and_neither_is_what_fails_after_closing(jobs, caplog):
+    def unwanted():
+        raise UnwantedError
+
+    gate = Gate()
+
+    def fail():
+        gate()
+        raise RuntimeError("the client disconnected")
+
+    jobs.submit(LANE, unwanted)
+    jobs.submit(LANE, fail)
+    assert gate.begun.wait(PATIENCE)
+    jobs.close()
+    gate.go.set()
+    jobs.settle()
+    assert jobs.errors == [] and caplog.text == ""
+
+
+@pytest.mark.parametrize("latest", [True, False])
+def test_resting_work_is_woken_by_the_next(jobs, latest):
+    begun = threading.Event()
+
+    def rest():
+        begun.set()
+        jobs.rest(LANE, PATIENCE)
+        jobs.done.append(jobs.superseded(LANE))
+
+    jobs.submit(LANE, rest)
+    assert begun.wait(PATIENCE)
+    jobs.note("next", latest=latest)
+    jobs.settle()
+    assert jobs.done == [True, "next"]
+
+
+def test_a_rest_ends_by_itself(jobs):
+    jobs.submit(LANE, lambda: (jobs.rest(LANE, 0.01), jobs.done.append(jobs.superseded(LANE))))
+    jobs.settle()
+    assert jobs.done == [False]
+
+
+def test_closing_lets_running_work_end_and_drops_what_waits_and_what_comes_later(jobs):
+    gate = Gate()
+    jobs.submit(LANE, lambda: (gate(), jobs.done.append(jobs.superseded(LANE))))
+    assert gate.begun.wait(PATIENCE)
+    jobs.note("waiting", latest=False)
+    jobs.close()
+    gate.go.set()
+    jobs.settle()
+    jobs.note("too late")
+    assert jobs.wait_idle(LANE, 1.0) and jobs.done == [True]
