@@ -8,7 +8,7 @@ from typing import Any
 
 import viser
 
-from dt_viz.avoidance.hand import Space
+from dt_viz.avoidance.avoidance import Space
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.paper_scenes import SCENES, PaperScene, offered
 from dt_viz.scenario.scenario import Scenario

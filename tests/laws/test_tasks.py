@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scenes import changed
 
-from dt_viz.avoidance.hand import SPACES
+from dt_viz.avoidance.avoidance import SPACES
 from dt_viz.flows.diffeomorphisms import min_det_jacobian, round_trip_error
 from dt_viz.metrics import discrete_frechet, resample_by_arc_length
 from dt_viz.robot.inverse_kinematics import inverse_kinematics, track
