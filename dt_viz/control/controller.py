@@ -93,8 +93,6 @@ class ArmController:
         self._feasible = FeasibleVelocities(follower.whole_arm, follower.body, settings)
         self._activity = Activity(rollout=rollout)
         self._progress: Progress | None = None
-        self._kept: tuple[Array, ...] = ()
-        """Distances that are kept; see `FeasibleVelocities.kept`."""
         self._q: Array | None = None
         """(6,) where the robot was sent, rad."""
         self._tick: Tick | None = None
@@ -220,7 +218,7 @@ class ArmController:
             rate = max(0.0, 1 - gap / settings.patience) if flow.cleared else 0.0
             self._progress = progress = before.advanced(rate, dt, settings.ramp)
             wanted = (flow.image(progress) - now) / dt + min(settings.gain, 0.5 / dt) * (now - q)
-            self._tick = tick = self._feasible.tick(q, wanted, dt, self._tick, flow.seen, flow.late, self._kept)
+            self._tick = tick = self._feasible.tick(q, wanted, dt, self._tick, flow.seen, flow.late)
             self._q = q + dt * tick.velocity
             if progress.ended and not before.ended:
                 if self._activity.let_go:
@@ -338,8 +336,8 @@ class ArmController:
 
     def _take(self, course: Course, *, pushed: bool = False) -> None:
         """Follow a course from its beginning; one that a push leads to comes no nearer to the table than before."""
-        if not pushed or not self._kept:
-            self._kept = self._feasible.kept(course.q)
+        if not pushed:
+            self._feasible.keep(course.q)
         rate = 0.0 if self._progress is None else self._progress.rate
         slowed = course.slowed(self.settings.course_speed * self.robot.velocity_limits)
         self._progress, self._flow.changed = Progress(slowed, rate=rate), True

@@ -57,12 +57,14 @@ class FeasibleVelocities:
             make(robot, body, settings.clearance, settings.contact_gain)
             for make in (ContactLimit.table, ContactLimit.itself)
         )
+        self._kept: tuple[Array, ...] = ()
+        """Distances that are kept, for each of these."""
         bounds = robot.lower, robot.upper, robot.velocity_limits
         self._limited = LimitedArm(robot.records, arm.links.spheres, *bounds, settings.acceleration)
 
-    def kept(self, q: Array) -> tuple[Array, ...]:
-        """Distances from the table, and of the arm's parts, that are kept in a motion along postures q (N, 6)."""
-        return tuple(limit.kept(q) for limit in self._contacts)
+    def keep(self, q: Array) -> None:
+        """Keep the distances from the table, and of the arm's parts, of a motion along postures q (N, 6)."""
+        self._kept = tuple(limit.kept(q) for limit in self._contacts)
 
     def tick(
         self,
@@ -72,7 +74,6 @@ class FeasibleVelocities:
         before: Tick | None,
         seen: Sighting,
         late: float,
-        kept: Sequence[Array],
     ) -> Tick:
         """Find the velocity for a tick.
 
@@ -83,19 +84,18 @@ class FeasibleVelocities:
             before: the last tick; None before the first one, when the robot stands still.
             seen: the obstacles.
             late: time since they were seen, seconds.
-            kept: see `kept`.
         """
         velocity = np.zeros(NUM_JOINTS) if before is None else before.velocity
         lower, upper = np.full(NUM_JOINTS, -np.inf), np.full(NUM_JOINTS, np.inf)
         for limit in self._limits:  # the last one's bounds, of acceleration, come first
             lowest, highest = limit.bounds(q, velocity, dt)
             lower, upper = _within(lower, lowest, highest), _within(upper, lowest, highest)
-        contacts = [limit.rows(q, least, dt) for limit, least in zip(self._contacts, kept, strict=True)]
+        contacts = [limit.rows(q, least, dt) for limit, least in zip(self._contacts, self._kept, strict=True)]
         there = replace(seen, avoidance=seen.expected(late, 0.0, self._settings.returning))
         *barrier, clearance = self._barrier.rows(q, there, dt)
         nearest = _nearest(wanted, lower, upper, [*contacts, barrier])
         previous = None if before is None else before.evasive
-        evasive = self._evasive(q, velocity, nearest, previous, seen, late, float(kept[0].min()))
+        evasive = self._evasive(q, velocity, nearest, previous, seen, late, float(self._kept[0].min()))
         if evasive is not None:
             nearest = _nearest(evasive, lower, upper, contacts)
         return Tick(q, wanted, nearest, evasive, contacts, clearance)
