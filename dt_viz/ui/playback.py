@@ -52,10 +52,16 @@ class Replay:
         return 0.0 if self.motion is None else max(0.0, self._moment - self.motion.times[-1])
 
     @property
-    def posture(self) -> tuple[Array, Array] | None:
-        """The joint angles (6,) now, rad, with and without avoidance."""
+    def q(self) -> Array | None:
+        """Joint angles (6,) now, rad; None before there is a motion."""
         motion = self.motion
-        return None if motion is None else at_moment(motion, min(self._moment, motion.times[-1]))
+        return None if motion is None else at_moment(motion, self._moment)[0]
+
+    @property
+    def undisturbed(self) -> Array | None:
+        """The same of the motion without avoidance."""
+        motion = self.motion
+        return None if motion is None else at_moment(motion, self._moment)[1]
 
     @property
     def _moment(self) -> float:
@@ -86,25 +92,9 @@ class Playback:
         self._thread.start()
 
     @property
-    def q(self) -> Array | None:
-        """Joint angles (6,) of the arm now, rad; None before there is a motion."""
-        if not self._replays:
-            return self.live.q
-        posture = self.replay.posture
-        return None if posture is None else posture[0]
-
-    @property
-    def without(self) -> Array | None:
-        """The same at this moment of the motion without avoidance."""
-        if not self._replays:
-            return self.live.undisturbed
-        posture = self.replay.posture
-        return None if posture is None else posture[1]
-
-    @property
-    def arrived(self) -> float:
-        """Time since the arm came to the goal, seconds; 0 before."""
-        return self.replay.arrived if self._replays else self.live.arrived
+    def arm(self) -> LiveArm | Replay:
+        """What moves now, with its joint angles `q` and `undisturbed`, (6,), rad, and the time since it `arrived`."""
+        return self.replay if self._replays else self.live
 
     def play(self, playing: bool, speed: float, *, replays: bool) -> None:
         """Choose how the arm moves.
@@ -114,8 +104,8 @@ class Playback:
             speed: its time, relative to real time.
             replays: whether it repeats its motion; when it does so no more, it goes on from where it is.
         """
-        if self._replays and not replays and self.q is not None:
-            self.live.put(self.q)
+        if self._replays and not replays and self.replay.q is not None:
+            self.live.put(self.replay.q)
         self._playing, self._speed, self._replays = playing, speed, replays
 
     def close(self) -> None:

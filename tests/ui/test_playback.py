@@ -46,8 +46,8 @@ class Player:
         self.playback = playback_of(self.arm, self.draw)
 
     def draw(self):
-        if self.playback.q is not None:
-            self.places.append(self.playback.q[0])
+        if self.playback.arm.q is not None:
+            self.places.append(self.playback.arm.q[0])
 
     def play(self, seconds):
         """The places where the arm is meanwhile."""
@@ -137,7 +137,7 @@ def test_its_time_has_the_chosen_pace_and_a_pause_stops_it(player):
     player.playback.play(False, 2.0, replays=False)
     assert player.play(0.5)[-1] == pytest.approx(1.0)
     assert player.arm.asked[-1] == (pytest.approx(2 * PICTURE), False)  # it still hears that its hand is held
-    np.testing.assert_array_equal(player.playback.without, np.ones(6))
+    np.testing.assert_array_equal(player.playback.arm.undisturbed, np.ones(6))
 
 
 class TestReplay:
@@ -152,7 +152,7 @@ class TestReplay:
         assert max(places) == 4.0 and places[-1] == pytest.approx(3.4, abs=0.1)
         assert sum(place == 4.0 for place in places) * PICTURE == pytest.approx(REST, abs=2 * PICTURE)
         assert player.arm.asked == []
-        assert player.playback.without[0] == pytest.approx(player.playback.q[0] + 1)
+        assert player.playback.arm.undisturbed[0] == pytest.approx(player.playback.arm.q[0] + 1)
 
     def test_a_new_motion_takes_over_at_the_same_moment(self, player):
         player.play(0.2)
@@ -168,7 +168,7 @@ class TestReplay:
         rests = []
         for _ in range(200):
             player.play(PICTURE)
-            rests.append((player.places[-1], player.playback.arrived))
+            rests.append((player.places[-1], player.playback.arm.arrived))
         assert all((rest > 0) <= (place == 4.0) for place, rest in rests)
         assert REST - 2 * PICTURE < max(rest for _, rest in rests) <= REST
 
@@ -179,4 +179,8 @@ class TestReplay:
 
     def test_without_a_motion_nothing_is_posed(self, player):
         player.playback.replay.motion = None
-        assert player.playback.q is None and player.playback.without is None and player.playback.arrived == 0
+        assert (
+            player.playback.arm.q is None
+            and player.playback.arm.undisturbed is None
+            and player.playback.arm.arrived == 0
+        )

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import viser
 
-from dt_viz.ui.scene.camera import PANEL
-from dt_viz.ui.scene.tripod import Tripod
+from dt_viz.ui.scene.camera import CameraController, Framing
 
 WIDTH, SIZE = 320, 92.5
 """Width of viser's panel, CSS pixels, and size of its type, % of the browser's own."""
@@ -18,7 +17,7 @@ STYLE = f"<style>@media (min-width: 577px) {{ :root {{ font-size: {SIZE * LARGER
 class BigType:
     """Size of the type of one visitor's page."""
 
-    def __init__(self, gui: viser.GuiApi, tripod: Tripod) -> None:
+    def __init__(self, gui: viser.GuiApi, tripod: CameraController) -> None:
         """Begin with the usual size; must be built outside tabs and folders, of which closed ones have no style."""
         self._style, self._panel, self._tripod = gui.add_html(STYLE, visible=False), gui.main_panel, tripod
 
@@ -27,4 +26,4 @@ class BigType:
         wider = (LARGER - 1) * WIDTH if on else 0.0
         self._style.visible = on
         self._panel.set_width(WIDTH + wider)
-        self._tripod.panel = PANEL + wider
+        self._tripod.reframe(panel=Framing.panel + wider)

@@ -9,8 +9,7 @@ import viser
 
 from dt_viz.ui.controls import Control, switch
 from dt_viz.ui.panel.commands import Command
-from dt_viz.ui.scene.camera import HAND, HOME, VIEWS
-from dt_viz.ui.scene.tripod import Tripod
+from dt_viz.ui.scene.camera import HAND, HOME, VIEWS, CameraController
 
 ORBIT_HINT = "turns slowly around what is shown; where you move the camera, it goes on from there"
 DARK_HINT = "for a dark room; pictures that are saved stay light"
@@ -27,7 +26,11 @@ class CameraControls:
     """The controls of one visitor's camera, theme and size of type, and the same as commands."""
 
     def __init__(
-        self, gui: viser.GuiApi, tripod: Tripod, darken: Callable[[bool], None], enlarge: Callable[[bool], None]
+        self,
+        gui: viser.GuiApi,
+        tripod: CameraController,
+        darken: Callable[[bool], None],
+        enlarge: Callable[[bool], None],
     ) -> None:
         """Build the controls where the panel is being built.
 

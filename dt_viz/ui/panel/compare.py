@@ -134,12 +134,12 @@ def _row(compared: Compared) -> str:
 
 def _cell(metres: float | None, *, bad: bool) -> str:
     text = NONE if metres is None else f"{_MILLIMETRES * metres:.0f}"
-    colour = f";color:{palette.ink(palette.FOLDED)}" if bad else ""
+    colour = f";color:{palette.ink(palette.LIGHT.folded)}" if bad else ""
     return f"<td style='{_CELL}{colour}'>{text}</td>"
 
 
 def _colour(name: str) -> tuple[int, int, int]:
-    return COLOURS.get(name, palette.ROLLOUT)
+    return COLOURS.get(name, palette.LIGHT.rollout)
 
 
 def _series(names: Sequence[str]) -> list[uplot.Series]:

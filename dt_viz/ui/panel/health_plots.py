@@ -29,11 +29,11 @@ class HealthPlots(Shown):
         with folder:
             self.table = gui.add_html("")
             gui.add_html(_legend())
-            self.lyapunov = _plot(gui, "Lyapunov value, relative to that of the start", palette.LEVEL)
+            self.lyapunov = _plot(gui, "Lyapunov value, relative to that of the start", palette.LIGHT.level)
             self._to = gui.add_html("")
-            self.distance = _plot(gui, "", palette.ROLLOUT)
+            self.distance = _plot(gui, "", palette.LIGHT.rollout)
             self._whose = gui.add_html("")
-            self.clearance = _plot(gui, "", palette.GOAL, zero=True)
+            self.clearance = _plot(gui, "", palette.LIGHT.goal, zero=True)
 
     def draw(self, profiles: Profiles | None) -> None:
         """Show these profiles; None leaves what is there."""
@@ -87,7 +87,9 @@ def _plot(gui: viser.GuiApi, title: str, colour: tuple[int, int, int], *, zero: 
         uplot.Series(label="without", stroke=css(colour), width=1.5, dash=(5, 4), points={"show": False}),
     ]
     if zero:
-        series.append(uplot.Series(label="contact", stroke=css(palette.ARM_RING), width=1, points={"show": False}))
+        series.append(
+            uplot.Series(label="contact", stroke=css(palette.LIGHT.arm_ring), width=1, points={"show": False})
+        )
     return gui.add_uplot((np.zeros(2),) * len(series), tuple(series), **{**LOOK, "height": HEIGHT})
 
 
@@ -101,8 +103,9 @@ def _legend() -> str:
         "border-top:{} {}'></span>{}"
     )
     both = (("2px solid", "with avoidance and biases"), ("2px dashed", "without"))
+    grey = css(palette.LIGHT.arm_ring)
     marks = "".join(
-        f"<span style='white-space:nowrap;margin-right:1em'>{mark.format(line, css(palette.ARM_RING), name)}</span>"
+        f"<span style='white-space:nowrap;margin-right:1em'>{mark.format(line, grey, name)}</span>"
         for line, name in both
     )
     return f"<div style='{SMALL}'>{marks}<br/><span style='opacity:0.65'>along the path, 0: start, 1: goal</span></div>"

@@ -41,11 +41,11 @@ from dt_viz.ui.panel.status import COLOURS, HINT, INK, hint, place_html, sentenc
 from dt_viz.ui.panel.status_line import StatusLine
 from dt_viz.ui.panel.transforms import add_transform_controls
 from dt_viz.ui.panel.verdict import Level
-from dt_viz.ui.scene.arm_layers import NUM_ARMS
+from dt_viz.ui.scene.arm import NUM_ARMS
+from dt_viz.ui.scene.camera import CameraController
 from dt_viz.ui.scene.export import RESOLUTIONS, PictureSaver
 from dt_viz.ui.scene.legend import Legend
 from dt_viz.ui.scene.picture import Colour
-from dt_viz.ui.scene.tripod import Tripod
 
 VIEW_LABELS: Mapping[str, str] = {
     "rollouts": "Rollouts",
@@ -98,7 +98,7 @@ class ControlPanel:
         robot: Robot,
         save_png: Callable[[str, bool], None],
         notify: Callable[[str, Colour], None],
-        tripod: Tripod,
+        tripod: CameraController,
         darken: Callable[[bool], None],
     ) -> None:
         """Build the controls; they act once `connect` has given them a session.
@@ -123,7 +123,7 @@ class ControlPanel:
         self._waits = False
         """Whether another task or scene than the reported one is being computed."""
         self._beginnings = LatestWorker[Callable[[], None]](lambda begin, _: begin(), self._stay, name="beginnings")
-        self._presentation = Presentation(gui, self._turn, partial(setattr, tripod, "alone"))
+        self._presentation = Presentation(gui, self._turn, lambda alone: tripod.reframe(alone=alone))
         self._bindings.show(self._title, self._presentation.entitle)
         big = BigType(gui, tripod)
         self._build_task()

@@ -58,7 +58,7 @@ class JointPlots(Following):
         self._robot = robot
         limited = [j for j in range(NUM_JOINTS) if np.isfinite(robot.lower[j])]
         self._limits = np.degrees(np.stack([robot.lower[limited], robot.upper[limited]], axis=1)).ravel()
-        bounded = [css(palette.JOINTS[j]) for j in limited for _ in range(2)]
+        bounded = [css(palette.LIGHT.joints[j]) for j in limited for _ in range(2)]
         blank = (np.zeros(2),)
         folder = gui.add_folder("Joints", visible=False)
         super().__init__(folder)
@@ -73,7 +73,7 @@ class JointPlots(Following):
             gui.add_html(f"<div style='{SMALL}'>Speed [% of its limit], up to {MAX_SPEED}; time [s]</div>")
             self.speeds = gui.add_uplot(
                 blank * (2 + NUM_JOINTS),
-                (uplot.Series(label="t [s]"), *_curves(), *_dashed([css(palette.ARM_RING)])),
+                (uplot.Series(label="t [s]"), *_curves(), *_dashed([css(palette.LIGHT.arm_ring)])),
                 **LOOK,
             )
 
@@ -93,7 +93,7 @@ def columns(*arrays: Array) -> tuple[NDArray[np.float64], ...]:
 def _curves() -> list[uplot.Series]:
     return [
         uplot.Series(label=f"{j + 1}", stroke=css(colour), width=2, points={"show": False})
-        for j, colour in enumerate(palette.JOINTS)
+        for j, colour in enumerate(palette.LIGHT.joints)
     ]
 
 
@@ -107,7 +107,7 @@ def _legend() -> str:
     marks = "".join(
         "<span style='white-space:nowrap;margin-right:0.8em'><span style='display:inline-block;width:0.9em;"
         f"height:0.3em;vertical-align:middle;margin-right:0.3em;background:{css(colour)}'></span>{j}</span>"
-        for j, colour in enumerate(palette.JOINTS, start=1)
+        for j, colour in enumerate(palette.LIGHT.joints, start=1)
     )
     return f"<div style='{SMALL}'><span style='opacity:0.65;margin-right:0.8em'>Joint</span>{marks}</div>"
 

@@ -31,8 +31,8 @@ from dt_viz.ui.panel.bindings import Bindings
 from dt_viz.ui.panel.transform_settings import add_transform_settings
 from dt_viz.ui.panel.warp import WarpControls
 from dt_viz.ui.scene import palette
-from dt_viz.ui.scene.levels import manifold
 from dt_viz.ui.scene.picture import Colour
+from dt_viz.ui.scene.rollouts import manifold
 
 BASE = "Base attractor"
 BELOW = 1e9
@@ -40,7 +40,7 @@ BELOW = 1e9
 ON, OFF, UP, DOWN, SHOW, SHOWN = "● on", "○ off", "↑", "↓", "show", "● shown"
 
 
-_COLOURS: Mapping[type[Transform], Colour] = {Avoidance: palette.OBSTACLE, BiasPoint: palette.BIAS}
+_COLOURS: Mapping[type[Transform], Colour] = {Avoidance: palette.LIGHT.obstacle, BiasPoint: palette.LIGHT.bias}
 """Colours of kinds of transforms in the formula; those of what is drawn of them."""
 
 
@@ -138,9 +138,8 @@ def legend_html(scenario: Scenario) -> str:
     """Return a legend of the selected level's lines; empty if none is selected."""
     if scenario.view.level not in levels(scenario):
         return ""
-    swatch = (
-        f"display:inline-block;width:1.6em;height:0.28em;vertical-align:middle;background:{palette.css(palette.LEVEL)}"
-    )
+    colour = palette.css(palette.LIGHT.level)
+    swatch = f"display:inline-block;width:1.6em;height:0.28em;vertical-align:middle;background:{colour}"
     what = manifold(scenario)
     return (
         "<div style='font-size:0.8em;padding:0.1em 0.9em 0.5em;opacity:0.85'>"
@@ -154,14 +153,14 @@ def formula_html(scenario: Scenario) -> str:
 
     The whole arm avoids in the space of its joints q, from which forward kinematics leads to the end effector.
     """
-    parts = [(IMITATION, _part("i", palette.LEVEL))] if scenario.imitation else []
+    parts = [(IMITATION, _part("i", palette.LIGHT.level))] if scenario.imitation else []
     for _, layer in scenario.active:
-        colour = _COLOURS.get(type(layer.transform), palette.STREAMLINE)
+        colour = _COLOURS.get(type(layer.transform), palette.LIGHT.streamline)
         parts.append((layer.name, _part(_index(layer.name), colour)))
     inner = "y"
     names = [f"{part} {html.escape(name)}" for name, part in parts]
     if scenario.arm_avoidance is not None and scenario.obstacles:
-        whole = _part("q", palette.WAY)
+        whole = _part("q", palette.LIGHT.way)
         inner, names = f"fk({whole}(q))", [*names, f"{whole} {WHOLE_ARM}"]
     formula = "".join(f"{part}(" for _, part in parts) + inner + ")" * len(parts)
     return (

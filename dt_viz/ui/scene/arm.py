@@ -1,6 +1,11 @@
-"""The JACO arm in the browser: its meshes are sent once, then six rotations for each posture."""
+"""The JACO arm in the browser, its ghost without avoidance, its body points, and arms along the motion.
+
+Meshes are sent once, then six rotations for each posture.
+"""
 
 from __future__ import annotations
+
+import threading
 
 import numpy as np
 import trimesh
@@ -9,16 +14,18 @@ from viser import transforms
 
 from dt_viz.avoidance.arm_field import LEVERS
 from dt_viz.flows.fields import Array
+from dt_viz.robot.body_points import load_body_points
 from dt_viz.robot.robot import NUM_JOINTS, Robot
-from dt_viz.ui.scene import palette
+from dt_viz.scenario.scenario import View
+from dt_viz.session.engine import ArmMotion
+from dt_viz.session.frame import Frame
 from dt_viz.ui.scene.links import bodies, light_shells
-from dt_viz.ui.scene.picture import Colour, Shown
+from dt_viz.ui.scene.palette import LIGHT, Colour, linear
+from dt_viz.ui.scene.picture import Following, Look, Picture, Shown, add_label, rgb
+from dt_viz.ui.scene.style import STYLES
 
 PEDESTAL = 2
 """Number of bodies that no motion moves away: the base, and link 1, which only spins."""
-STALE_OPACITY = 0.4
-"""Opacity of the arm while its motion is not the scenario's."""
-GHOST_OPACITY = 0.5
 SEEN = 4e-4
 """Smallest motion of the hand by a joint that is drawn, metres: a third of a pixel, about."""
 MIN_APART = 0.006
@@ -58,18 +65,13 @@ class ArmPicture:
         self.frames = self._tree.frames
         self.meshes: list[viser.MeshHandle] = []
         for frame, body in zip(self.frames, bodies(robot.joint_names), strict=True):
-            for part, mesh, colour in (("shell", body.shell, palette.ARM), ("rings", body.rings, palette.ARM_RING)):
+            for part, mesh, colour in (("shell", body.shell, LIGHT.arm), ("rings", body.rings, LIGHT.arm_ring)):
                 if mesh is not None:
                     self.meshes.append(
                         scene.add_mesh_simple(f"{frame.name}/{part}", mesh.vertices, mesh.faces, color=colour)
                     )
-        self._note = scene.add_label(
-            f"{self.frames[-1].name}/note",
-            "last good motion",
-            anchor="bottom-center",
-            font_screen_scale=0.8,
-            visible=False,
-        )
+        self._note = add_label(scene, f"{self.frames[-1].name}/note", "last good motion")
+        self._note.visible = False
         self.pose(robot.home)
 
     def pose(self, q: Array) -> None:
@@ -95,14 +97,14 @@ class ArmPicture:
     def stale(self, stale: bool) -> None:
         self._note.visible = stale
         for mesh in self.meshes:
-            mesh.opacity = STALE_OPACITY if stale else None
+            mesh.opacity = STYLES.arm_stale.opacity if stale else None
 
 
 class GhostArm(Shown):
     """A translucent arm, such as that without avoidance; links that coincide with the arm's are hidden."""
 
     def __init__(
-        self, scene: viser.SceneApi, robot: Robot, name: str = "/ghost_arm", colour: Colour = palette.GHOST
+        self, scene: viser.SceneApi, robot: Robot, name: str = "/ghost_arm", colour: Colour = LIGHT.ghost
     ) -> None:
         """Make the arm, hidden, under a name in the scene tree."""
         self._robot = robot
@@ -117,7 +119,7 @@ class GhostArm(Shown):
                 shell.vertices,
                 shell.faces,
                 color=colour,
-                opacity=GHOST_OPACITY,
+                opacity=STYLES.arm_ghost.opacity,
                 cast_shadow=False,
                 receive_shadow=False,
             )
@@ -133,3 +135,132 @@ class GhostArm(Shown):
         moved = np.linalg.norm(corners[1] - corners[0], axis=-1).max(axis=-1)
         for link, distance in zip(self.links, moved, strict=True):
             link.visible = bool(distance > MIN_APART)
+
+
+NUM_ARMS = 6
+"""Number of arms along the motion, start and goal included."""
+IDENTITY = (1.0, 0.0, 0.0, 0.0)
+
+
+def evenly_along(path: Array, num: int) -> Array:
+    """Return `num` places, in samples from the start, evenly along a path (T, d), its ends included."""
+    steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    length = np.concatenate([[0.0], np.cumsum(steps + 1e-9)])  # strictly increasing, also where the path rests
+    return np.interp(np.linspace(0, length[-1], num), length, np.arange(len(path)))
+
+
+def arms_along(robot: Robot, motion: ArmMotion, num: int = NUM_ARMS) -> Array:
+    """Return joint angles (num, 6), rad, at places evenly along the path of the hand."""
+    places = evenly_along(robot.end_effector(motion.q), num)
+    samples = np.arange(len(motion.q))
+    return np.stack([np.interp(places, samples, angle) for angle in motion.q.T], axis=1)
+
+
+class Onion(Following, Picture):
+    """Several arms along the motion, from faint at its start to strong at its end; a drag sends only their poses."""
+
+    def __init__(self, scene: viser.SceneApi, robot: Robot) -> None:
+        super().__init__(scene.add_frame("/onion", show_axes=False, visible=False))
+        self._robot = robot
+        opacities = np.linspace(0.12, 0.5, NUM_ARMS, dtype=np.float32)
+        self.links = tuple(
+            scene.add_batched_meshes_simple(
+                f"/onion/link_{index}",
+                shell.vertices,
+                shell.faces,
+                np.tile(IDENTITY, (NUM_ARMS, 1)),
+                np.zeros((NUM_ARMS, 3)),
+                batched_colors=np.array(linear(LIGHT.onion), np.uint8),
+                batched_opacities=opacities,
+                lod="off",
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+            for index, shell in list(enumerate(light_shells(robot.joint_names)))[PEDESTAL:]
+        )
+
+    def draw(self, frame: Frame, look: Look) -> None:
+        self.follow(frame.arm)
+
+    def _show(self, motion: ArmMotion) -> None:
+        rotations, origins = self._robot.forward_kinematics(arms_along(self._robot, motion))
+        wxyzs = transforms.SO3.from_matrix(rotations).wxyz
+        for joint, link in enumerate(self.links, start=PEDESTAL - 1):
+            # the browser blends nodes from far to near by their own positions
+            link.position = middle = origins[:, joint].mean(axis=0)
+            link.batched_positions = (origins[:, joint] - middle).astype(np.float32)
+            link.batched_wxyzs = wxyzs[:, joint].astype(np.float32)
+
+
+class BodySpheres(Shown):
+    """The spheres that cover the arm, with their displacements by avoidance: the larger, the stronger the colour."""
+
+    def __init__(self, scene: viser.SceneApi, radius: Array) -> None:
+        """Make spheres of these radii (P,), metres."""
+        super().__init__(scene.add_frame("/body_points", show_axes=False, visible=False))
+        num = len(radius)
+        ball = trimesh.creation.icosphere(subdivisions=2)
+        self.spheres = scene.add_batched_meshes_simple(
+            "/body_points/spheres",
+            ball.vertices,
+            ball.faces,
+            np.tile(IDENTITY, (num, 1)),
+            np.zeros((num, 3)),
+            batched_scales=radius.astype(np.float32),
+            batched_colors=np.zeros((num, 3), np.uint8),
+            opacity=STYLES.body_points.opacity,
+            lod="off",
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+        self.paths = scene.add_line_segments(
+            "/body_points/paths",
+            np.zeros((num, 2, 3), np.float32),
+            rgb(LIGHT.body_path, (num, 2, 3)),
+            thickness=STYLES.body_path.width,
+        )
+
+    def pose(self, positions: Array, without: Array) -> None:
+        """Show the spheres at `positions` (P, 3), with lines from those `without` avoidance (P, 3), metres."""
+        moved = np.linalg.norm(positions - without, axis=1, keepdims=True)
+        still, far = (np.array(linear(colour)) for colour in (LIGHT.body_point, LIGHT.body_point_moved))
+        relative = np.minimum(moved / 0.1, 1)  # moved by a decimetre, they have the full colour
+        self.spheres.position = middle = positions.mean(axis=0)
+        self.spheres.batched_positions = (positions - middle).astype(np.float32)
+        self.spheres.batched_colors = (still + relative * (far - still)).astype(np.uint8)
+        self.paths.points = np.stack([without, positions], axis=1).astype(np.float32)
+
+
+class Arms:
+    """The arm, its ghost without avoidance, and its body points, which move with the playback."""
+
+    def __init__(self, scene: viser.SceneApi, robot: Robot) -> None:
+        self._robot = robot
+        self._points = load_body_points()
+        self.arm = ArmPicture(scene, robot)
+        self.ghost = GhostArm(scene, robot)
+        self.body = BodySpheres(scene, self._points.radius)
+        self._now = (robot.home, robot.home)
+        self._posing = threading.Lock()  # the playback poses, another thread shows and hides
+
+    def pose(self, q: Array, without: Array) -> None:
+        """Show the joint angles `q` (6,), rad, and those `without` avoidance (6,), rad."""
+        with self._posing:
+            self._now = (q, without)
+            self.arm.pose(q)
+            self._pose_beside()
+
+    def show(self, view: View) -> None:
+        """Show and hide the parts as the view says."""
+        with self._posing:
+            self.arm.show(whole=view.arm, pedestal=view.ghost_arm or view.onion)
+            self.ghost.visible, self.body.visible = view.ghost_arm, view.body_points
+            self._pose_beside()
+
+    def _pose_beside(self) -> None:
+        """Pose the visible parts beside the arm; hidden ones are posed when they are shown."""
+        q, without = self._now
+        if self.ghost.visible:
+            self.ghost.pose(q, without)
+        if self.body.visible:
+            self.body.pose(*self._points.positions(self._robot, np.stack([q, without])))
