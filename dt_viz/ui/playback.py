@@ -10,6 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from dt_viz.flows.fields import Array
+from dt_viz.metrics import interpolate
 from dt_viz.session.engine import ArmMotion
 from dt_viz.session.robot_loop import REST, LiveArm
 
@@ -19,15 +20,6 @@ SHORTEST, LONGEST = 1 / 20, 1 / 6
 """Bounds of the time from one picture of the arm to the next, seconds."""
 PART = 1 / 12
 """Part of that time that moving and drawing the arm takes, at most: the more visitors there are, the fewer pictures."""
-
-
-def at_moment(motion: ArmMotion, moment: float) -> tuple[Array, Array]:
-    """Return the joint angles (6,), rad, with and without avoidance at a moment, seconds after the start."""
-    place = float(np.interp(moment, motion.times, np.arange(len(motion.times))))
-    before = min(int(place), len(motion.times) - 2)
-    weight = place - before
-    q, without = ((1 - weight) * path[before] + weight * path[before + 1] for path in (motion.q, motion.without))
-    return q, without
 
 
 class Replay:
@@ -55,13 +47,13 @@ class Replay:
     def q(self) -> Array | None:
         """Joint angles (6,) now, rad; None before there is a motion."""
         motion = self.motion
-        return None if motion is None else at_moment(motion, self._moment)[0]
+        return None if motion is None else interpolate(np.array([self._moment]), motion.times, motion.q)[0]
 
     @property
     def undisturbed(self) -> Array | None:
         """The same of the motion without avoidance."""
         motion = self.motion
-        return None if motion is None else at_moment(motion, self._moment)[1]
+        return None if motion is None else interpolate(np.array([self._moment]), motion.times, motion.without)[0]
 
     @property
     def _moment(self) -> float:

@@ -21,7 +21,7 @@ from dt_viz.session.engine import ArmMotion
 from dt_viz.session.frame import Stage
 from dt_viz.ui.panel.panel import VIEW_LABELS
 from dt_viz.ui.panel.plots import NUM_SAMPLES, JointPlots, joint_curves
-from dt_viz.ui.scene.arm import NUM_ARMS, PEDESTAL, SEEN, ArmPicture, Arms, Onion, arms_along, evenly_along
+from dt_viz.ui.scene.arm import NUM_ARMS, PEDESTAL, SEEN, ArmPicture, Arms, ArmSequence, arms_along
 from dt_viz.ui.scene.links import CELL, bodies, light_shells, simplified
 from dt_viz.ui.scene.palette import LIGHT
 from dt_viz.ui.scene.picture import Arrows, Lines, Look
@@ -48,11 +48,12 @@ def frame(arm=None, *, scenario=None, **changes):
 # --- Along the motion ---
 
 
-def test_a_path_that_rests_has_places_too():
-    path = np.repeat([[0.0, 0.0], [1.0, 0.0]], 5, axis=0)
-    places = evenly_along(path, 3)
-    assert places[0] == 0 and 4 < places[1] < 5 and places[2] == 9
-    assert np.isfinite(evenly_along(np.zeros((4, 3)), 3)).all()
+def test_a_motion_that_rests_has_arms_too():
+    q = np.repeat([ROBOT.home, REACHING], 5, axis=0)
+    first, middle, last = arms_along(ROBOT, ArmMotion(np.arange(10.0), q, q), 3)
+    np.testing.assert_allclose([first, last], [ROBOT.home, REACHING], atol=1e-9)
+    np.testing.assert_allclose(middle, (ROBOT.home + REACHING) / 2, atol=1e-6)
+    assert np.isfinite(arms_along(ROBOT, ArmMotion(np.arange(4.0), q[:4], q[:4]), 3)).all()
 
 
 def test_arms_go_from_start_to_goal_with_the_hand_in_equal_steps():
@@ -109,7 +110,7 @@ def world_pose(handles, index):
 
 def test_arms_along_the_motion_stand_where_the_arm_would(scene):
     """The arm is a tree of frames, those along the motion are placed in the world: both by the same kinematics."""
-    onion, arms, arm = Onion(scene, ROBOT), Arms(scene, ROBOT), motion()
+    onion, arms, arm = ArmSequence(scene, ROBOT), Arms(scene, ROBOT), motion()
     onion.draw(frame(arm), Look())
     onion.visible = True  # drawn while hidden: it catches up
     for which, q in enumerate(arms_along(ROBOT, arm)):
@@ -122,7 +123,7 @@ def test_arms_along_the_motion_stand_where_the_arm_would(scene):
 
 
 def test_arms_along_the_motion_send_nothing_while_hidden_and_follow_while_shown(scene):
-    onion = Onion(scene, ROBOT)
+    onion = ArmSequence(scene, ROBOT)
     before = onion.links[0].batched_positions.copy()
     onion.draw(frame(motion()), Look())
     np.testing.assert_array_equal(onion.links[0].batched_positions, before)
@@ -145,8 +146,8 @@ def test_body_points_move_with_the_arm_and_lines_say_from_where(scene):
         body.spheres.position + body.spheres.batched_positions, points.positions(ROBOT, q), atol=1e-6
     )
     np.testing.assert_allclose(np.asarray(body.spheres.batched_scales), points.radius, atol=1e-7)
-    np.testing.assert_allclose(body.paths.points[:, 0], points.positions(ROBOT, without), atol=1e-6)
-    np.testing.assert_allclose(body.paths.points[:, 1], points.positions(ROBOT, q), atol=1e-6)
+    np.testing.assert_allclose(body.paths.node.points[:, 0], points.positions(ROBOT, without), atol=1e-6)
+    np.testing.assert_allclose(body.paths.node.points[:, 1], points.positions(ROBOT, q), atol=1e-6)
     on_base, on_hand = body.spheres.batched_colors[points.joint < 0], body.spheres.batched_colors[points.joint == 5]
     assert (on_base == on_base[0]).all() and (on_hand != on_base[0]).any(axis=1).all()
 

@@ -6,6 +6,7 @@ Meshes are sent once, then six rotations for each posture.
 from __future__ import annotations
 
 import threading
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -14,6 +15,7 @@ from viser import transforms
 
 from dt_viz.avoidance.arm_field import LEVERS
 from dt_viz.flows.fields import Array
+from dt_viz.metrics import interpolate
 from dt_viz.robot.body_points import load_body_points
 from dt_viz.robot.robot import NUM_JOINTS, Robot
 from dt_viz.scenario.scenario import View
@@ -21,7 +23,7 @@ from dt_viz.session.engine import ArmMotion
 from dt_viz.session.frame import Frame
 from dt_viz.ui.scene.links import bodies, light_shells
 from dt_viz.ui.scene.palette import LIGHT, Colour, linear
-from dt_viz.ui.scene.picture import Following, Look, Picture, Shown, add_label, rgb
+from dt_viz.ui.scene.picture import Following, Lines, Look, Picture, Shown, add_label
 from dt_viz.ui.scene.style import STYLES
 
 PEDESTAL = 2
@@ -57,12 +59,11 @@ class ArmFrames:
             self.frames[joint + 1].wxyz = wxyzs[joint]
 
 
-class ArmPicture:
+class ArmPicture(ArmFrames):
     """The arm with its meshes."""
 
     def __init__(self, scene: viser.SceneApi, robot: Robot) -> None:
-        self._tree = ArmFrames(scene, robot, "/arm")
-        self.frames = self._tree.frames
+        super().__init__(scene, robot, "/arm")
         self.meshes: list[viser.MeshHandle] = []
         for frame, body in zip(self.frames, bodies(robot.joint_names), strict=True):
             for part, mesh, colour in (("shell", body.shell, LIGHT.arm), ("rings", body.rings, LIGHT.arm_ring)):
@@ -70,13 +71,8 @@ class ArmPicture:
                     self.meshes.append(
                         scene.add_mesh_simple(f"{frame.name}/{part}", mesh.vertices, mesh.faces, color=colour)
                     )
-        self._note = add_label(scene, f"{self.frames[-1].name}/note", "last good motion")
-        self._note.visible = False
+        self._note = add_label(scene, f"{self.frames[-1].name}/note", "last good motion", visible=False)
         self.pose(robot.home)
-
-    def pose(self, q: Array) -> None:
-        """Show the joint angles `q` (6,), rad."""
-        self._tree.pose(q)
 
     def show(self, *, whole: bool, pedestal: bool) -> None:
         """Show the whole arm, or only the pedestal under other pictures of it, or nothing."""
@@ -139,42 +135,39 @@ class GhostArm(Shown):
 
 NUM_ARMS = 6
 """Number of arms along the motion, start and goal included."""
-IDENTITY = (1.0, 0.0, 0.0, 0.0)
-
-
-def evenly_along(path: Array, num: int) -> Array:
-    """Return `num` places, in samples from the start, evenly along a path (T, d), its ends included."""
-    steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
-    length = np.concatenate([[0.0], np.cumsum(steps + 1e-9)])  # strictly increasing, also where the path rests
-    return np.interp(np.linspace(0, length[-1], num), length, np.arange(len(path)))
 
 
 def arms_along(robot: Robot, motion: ArmMotion, num: int = NUM_ARMS) -> Array:
-    """Return joint angles (num, 6), rad, at places evenly along the path of the hand."""
-    places = evenly_along(robot.end_effector(motion.q), num)
-    samples = np.arange(len(motion.q))
-    return np.stack([np.interp(places, samples, angle) for angle in motion.q.T], axis=1)
+    """Return joint angles (num, 6), rad, evenly along the path of the hand, its ends included."""
+    steps = np.linalg.norm(np.diff(robot.end_effector(motion.q), axis=0), axis=1)
+    length = np.concatenate([[0.0], np.cumsum(steps + 1e-9)])  # strictly increasing, also where the hand rests
+    return interpolate(np.linspace(0, length[-1], num), length, motion.q)
 
 
-class Onion(Following, Picture):
+def _add_copies(
+    scene: viser.SceneApi,
+    name: str,
+    mesh: trimesh.Trimesh,
+    num: int,
+    **look: Any,  # noqa: ANN401 - as viser's
+) -> viser.BatchedMeshHandle:
+    """Add so many copies of a mesh that are moved one by one, with viser's further options."""
+    unturned = np.tile((1.0, 0.0, 0.0, 0.0), (num, 1))
+    look |= {"lod": "off", "cast_shadow": False, "receive_shadow": False}
+    return scene.add_batched_meshes_simple(name, mesh.vertices, mesh.faces, unturned, np.zeros((num, 3)), **look)
+
+
+class ArmSequence(Following, Picture):
     """Several arms along the motion, from faint at its start to strong at its end; a drag sends only their poses."""
 
     def __init__(self, scene: viser.SceneApi, robot: Robot) -> None:
         super().__init__(scene.add_frame("/onion", show_axes=False, visible=False))
         self._robot = robot
+        colour = np.array(linear(LIGHT.onion), np.uint8)
         opacities = np.linspace(0.12, 0.5, NUM_ARMS, dtype=np.float32)
         self.links = tuple(
-            scene.add_batched_meshes_simple(
-                f"/onion/link_{index}",
-                shell.vertices,
-                shell.faces,
-                np.tile(IDENTITY, (NUM_ARMS, 1)),
-                np.zeros((NUM_ARMS, 3)),
-                batched_colors=np.array(linear(LIGHT.onion), np.uint8),
-                batched_opacities=opacities,
-                lod="off",
-                cast_shadow=False,
-                receive_shadow=False,
+            _add_copies(
+                scene, f"/onion/link_{index}", shell, NUM_ARMS, batched_colors=colour, batched_opacities=opacities
             )
             for index, shell in list(enumerate(light_shells(robot.joint_names)))[PEDESTAL:]
         )
@@ -198,27 +191,16 @@ class BodySpheres(Shown):
     def __init__(self, scene: viser.SceneApi, radius: Array) -> None:
         """Make spheres of these radii (P,), metres."""
         super().__init__(scene.add_frame("/body_points", show_axes=False, visible=False))
-        num = len(radius)
-        ball = trimesh.creation.icosphere(subdivisions=2)
-        self.spheres = scene.add_batched_meshes_simple(
+        self.spheres = _add_copies(
+            scene,
             "/body_points/spheres",
-            ball.vertices,
-            ball.faces,
-            np.tile(IDENTITY, (num, 1)),
-            np.zeros((num, 3)),
+            trimesh.creation.icosphere(subdivisions=2),
+            len(radius),
             batched_scales=radius.astype(np.float32),
-            batched_colors=np.zeros((num, 3), np.uint8),
+            batched_colors=np.zeros((len(radius), 3), np.uint8),
             opacity=STYLES.body_points.opacity,
-            lod="off",
-            cast_shadow=False,
-            receive_shadow=False,
         )
-        self.paths = scene.add_line_segments(
-            "/body_points/paths",
-            np.zeros((num, 2, 3), np.float32),
-            rgb(LIGHT.body_path, (num, 2, 3)),
-            thickness=STYLES.body_path.width,
-        )
+        self.paths = Lines(scene, "/body_points/paths", STYLES.body_path)
 
     def pose(self, positions: Array, without: Array) -> None:
         """Show the spheres at `positions` (P, 3), with lines from those `without` avoidance (P, 3), metres."""
@@ -228,7 +210,7 @@ class BodySpheres(Shown):
         self.spheres.position = middle = positions.mean(axis=0)
         self.spheres.batched_positions = (positions - middle).astype(np.float32)
         self.spheres.batched_colors = (still + relative * (far - still)).astype(np.uint8)
-        self.paths.points = np.stack([without, positions], axis=1).astype(np.float32)
+        self.paths.show_segments(np.stack([without, positions], axis=1), LIGHT)
 
 
 class Arms:

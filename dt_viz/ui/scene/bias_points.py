@@ -21,7 +21,7 @@ from dt_viz.session.frame import Frame
 from dt_viz.session.session import Session
 from dt_viz.ui.scene.markers import Marker, MarkerGroup
 from dt_viz.ui.scene.palette import LIGHT
-from dt_viz.ui.scene.picture import Look, add_ball
+from dt_viz.ui.scene.picture import Look, add_ball, add_label
 from dt_viz.ui.scene.style import STYLES
 
 
@@ -42,9 +42,7 @@ class BiasMarker(Marker):
             thickness_units="screen",
             visible=False,
         )
-        self._label = scene.add_label(
-            f"{node}/label", "", position=(0.0, 0.0, 0.0), anchor="top-left", font_screen_scale=0.8
-        )
+        self._label = add_label(scene, f"{node}/label", anchor="top-left")
         super().__init__(group, gizmo, self.ball, scale=0.11)
 
     def adopt(self, name: str, transform: Transform, *, on: bool, handles: bool) -> None:
@@ -106,8 +104,9 @@ class BiasPoints(MarkerGroup[BiasMarker]):
         self._show_regions()
 
     def _show_regions(self) -> None:
-        for marker in self.items:
-            marker.show_region(self._used.get(marker.key) or self._regions.get(marker.key))
+        with self._changing:
+            for marker in self.items:
+                marker.show_region(self._used.get(marker.key) or self._regions.get(marker.key))
 
     def _new(self, index: int) -> BiasMarker:
         return BiasMarker(self, index)

@@ -15,7 +15,7 @@ from dt_viz.robot.robot import Robot
 from dt_viz.session.frame import Frame
 from dt_viz.ui.scene.markers import Draggable, Marker
 from dt_viz.ui.scene.palette import Theme
-from dt_viz.ui.scene.picture import Lines, Look, Shown, add_ball, assign
+from dt_viz.ui.scene.picture import Lines, Look, Shown, add_ball, add_label, assign
 from dt_viz.ui.scene.style import STYLES
 from dt_viz.ui.scene.tubes import RolloutTubes
 
@@ -59,8 +59,8 @@ class Grip(Draggable[_HandMarker]):
         offset = tuple(robot.end_effector_offset)
         options = {"position": offset, "opacity": 0.85, "cast_shadow": False, "visible": False}
         super().__init__(add_ball(scene, f"{node}/grip", STYLES.grip, **options))
-        at = {"position": (0.0, 0.0, 0.0), "anchor": "bottom-left", "font_screen_scale": 0.8}
-        self._note, self._said = scene.add_label(f"{node}/grip/note", "", visible=False, **at), ""
+        self._note = add_label(scene, f"{node}/grip/note", anchor="bottom-left", visible=False)
+        self._said = ""
         self._held = held
         _HandMarker(self, self.node, where)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -165,6 +166,7 @@ class MarkerGroup(Draggable[M]):
         super().__init__(node)
         self.scene, self._session = scene, session
         self.items: list[M] = []
+        self._changing = threading.Lock()  # one thread draws, another makes and removes markers
 
     @abstractmethod
     def adopt(self, scenario: Scenario) -> None:
@@ -208,13 +210,14 @@ class MarkerGroup(Draggable[M]):
 
     def _fit(self, num: int) -> None:
         """Make or remove markers until there are so many."""
-        while len(self.items) > num:
-            self.items.pop().node.remove()
-        while len(self.items) < num:
-            marker = self._new(len(self.items))
-            self.items.append(marker)
-            if marker.body is not None:
-                gestures.on_click(marker.body, partial(self.clicked, marker))
+        with self._changing:
+            while len(self.items) > num:
+                self.items.pop().node.remove()
+            while len(self.items) < num:
+                marker = self._new(len(self.items))
+                self.items.append(marker)
+                if marker.body is not None:
+                    gestures.on_click(marker.body, partial(self.clicked, marker))
 
     def draw(self, frame: Frame, look: Look) -> None:
         """Remembers the slice for drags."""
@@ -223,13 +226,16 @@ class MarkerGroup(Draggable[M]):
     @contextmanager
     def without_handles(self) -> Iterator[None]:
         """Hide the handles, not what they move, while a picture is made."""
-        for marker in self.items:
-            marker.hide_handles(True)
+        self._hide_handles(True)
         try:
             yield
         finally:
+            self._hide_handles(False)
+
+    def _hide_handles(self, hidden: bool) -> None:
+        with self._changing:
             for marker in self.items:
-                marker.hide_handles(False)
+                marker.hide_handles(hidden)
 
 
 def in_slice(area: Slice | None, camera: Array, grabbed: Array, pointer: Array) -> Array:

@@ -80,14 +80,7 @@ class Theme:
     body_point: Colour = (170, 178, 190)
     body_point_moved: Colour = (0, 158, 115)
     body_path: Colour = (0, 92, 66)
-    joints: tuple[Colour, ...] = (
-        (230, 159, 0),
-        (86, 180, 233),
-        (0, 158, 115),
-        (0, 114, 178),
-        (213, 94, 0),
-        (204, 121, 167),
-    )
+    joints: tuple[Colour, ...] = (bias, demonstration, goal, level, rollout, obstacle)
     """Curves of the six joints, base to hand."""
     compared: tuple[Colour, ...] = (
         (120, 94, 200),

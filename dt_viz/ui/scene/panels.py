@@ -32,7 +32,7 @@ class PanelNodes:
         self._arrows = Arrows(scene, f"{name}/arrows", STYLES.panel_generator)
         self.rollouts = Tubes(scene, f"{name}/rollouts", STYLES.panel_rollout)
         self._goal = add_ball(scene, f"{name}/goal", STYLES.panel_goal)
-        self._title = add_label(scene, f"{name}/title", size=1.1)
+        self._title = add_label(scene, f"{name}/title", font_screen_scale=1.1)
         self._drawn: tuple[PanelPicture, Theme] | None = None
 
     def draw(self, panel: PanelPicture, camera: tuple[Point, Point], theme: Theme) -> None:

@@ -86,7 +86,7 @@ class Look:
 class Picture(Shown, ABC):
     """A part of the scene that is drawn from frames."""
 
-    _drawn: tuple[object, ...] = ()
+    _sources: tuple[object, ...] = ()
     """What it was drawn from last."""
 
     @abstractmethod
@@ -95,7 +95,7 @@ class Picture(Shown, ABC):
 
     def _is_new(self, *drawn: object) -> bool:
         """Whether it was drawn from other objects than these, and note that it is drawn from these now."""
-        before, self._drawn = self._drawn, drawn
+        before, self._sources = self._sources, drawn
         return len(before) != len(drawn) or any(a is not b for a, b in zip(before, drawn, strict=True))
 
 
@@ -184,10 +184,17 @@ class Arrows:
         assign(self.node, ends, (weak + relative * (strong - weak)).astype(np.uint8))
 
 
-def add_label(scene: viser.SceneApi, name: str, text: str = "", *, size: float = 0.8, height: float = 0.0) -> Any:  # noqa: ANN401
-    """Add a text of a size relative to viser's usual one, whose foot is a height, metres, above its node's origin."""
-    at = (0.0, 0.0, height)
-    return scene.add_label(name, text, position=at, anchor="bottom-center", font_screen_scale=size)
+def add_label(
+    scene: viser.SceneApi,
+    name: str,
+    text: str = "",
+    *,
+    height: float = 0.0,
+    **options: Any,  # noqa: ANN401 - as viser's
+) -> viser.LabelHandle:
+    """Add a text whose foot is a height, metres, above the origin of its parent, with viser's further options."""
+    usual = {"position": (0.0, 0.0, height), "anchor": "bottom-center", "font_screen_scale": 0.8}
+    return scene.add_label(name, text, **(usual | options))
 
 
 def add_ball(scene: viser.SceneApi, name: str, style: BallStyle, **options: Any) -> viser.IcosphereHandle:  # noqa: ANN401

@@ -88,7 +88,7 @@ class LevelRollouts(Picture):
         self.end = scene.add_frame("/level/end", show_axes=False, visible=False)
         add_ball(scene, "/level/end/ball", STYLES.level_end)
         add_label(scene, "/level/end/label", "its end", height=0.02)
-        self.label = add_label(scene, "/level/label", size=1.1)
+        self.label = add_label(scene, "/level/label", font_screen_scale=1.1)
 
     def draw(self, frame: Frame, look: Look) -> None:
         if frame.level is not None:

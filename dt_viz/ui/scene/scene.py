@@ -16,7 +16,7 @@ from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import anchored
 from dt_viz.session.frame import Frame
 from dt_viz.session.session import Session
-from dt_viz.ui.scene.arm import Onion
+from dt_viz.ui.scene.arm import ArmSequence
 from dt_viz.ui.scene.bias_points import BiasPoints
 from dt_viz.ui.scene.comparison import ComparedMotions
 from dt_viz.ui.scene.obstacles import Obstacles
@@ -89,7 +89,7 @@ class ScenePictures:
             "generator": Generator(scene),
             "grid": WarpedGrid(scene),
             "panels": Panels(scene),
-            "onion": Onion(scene, robot),
+            "onion": ArmSequence(scene, robot),
             "compared": ComparedMotions(scene),
         }
         function = ColourSlice(scene)

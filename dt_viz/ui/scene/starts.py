@@ -29,8 +29,9 @@ class Starts(MarkerGroup[Marker]):
     def draw(self, frame: Frame, look: Look) -> None:
         """Remembers the slice; starts without a motion are grey."""
         self.area = frame.slice
-        for marker in self.items:
-            marker.node.color = look.theme.added
+        with self._changing:
+            for marker in self.items:
+                marker.node.color = look.theme.added
 
     def adopt(self, scenario: Scenario) -> None:
         """Show the scenario's starts, and listen to clicks on the slice if the view says so."""
@@ -62,7 +63,7 @@ class Starts(MarkerGroup[Marker]):
     def _new(self, index: int) -> Marker:
         node = f"/starts/{index}"
         ball = add_ball(self.scene, node, STYLES.start, subdivisions=2, cast_shadow=False)
-        add_label(self.scene, f"{node}/label", str(index + 1), size=0.6, height=STYLES.start.radius)
+        add_label(self.scene, f"{node}/label", str(index + 1), font_screen_scale=0.6, height=STYLES.start.radius)
         return Marker(self, ball, ball, key=index)
 
     def _move(self, session: Session, marker: Marker, position: Array, wxyz: Array) -> None:
