@@ -10,7 +10,7 @@ import viser
 from dt_viz.ui.panel.commands import MAX_DIGIT, Command
 from dt_viz.ui.panel.status import SMALL
 from dt_viz.ui.scene import palette
-from dt_viz.ui.scene.picture import Colour
+from dt_viz.ui.scene.palette import Colour
 
 TITLE = "Diffeomorphic Transforms for Generalised Imitation Learning"
 AUTHORS = "Weiming Zhi, Tin Lai, Lionel Ott, Fabio Ramos"

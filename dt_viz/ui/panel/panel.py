@@ -45,7 +45,7 @@ from dt_viz.ui.scene.arm import NUM_ARMS
 from dt_viz.ui.scene.camera import CameraController
 from dt_viz.ui.scene.export import RESOLUTIONS, PictureSaver
 from dt_viz.ui.scene.legend import Legend
-from dt_viz.ui.scene.picture import Colour
+from dt_viz.ui.scene.palette import Colour
 
 VIEW_LABELS: Mapping[str, str] = {
     "rollouts": "Rollouts",

@@ -31,7 +31,7 @@ from dt_viz.ui.panel.bindings import Bindings
 from dt_viz.ui.panel.transform_settings import add_transform_settings
 from dt_viz.ui.panel.warp import WarpControls
 from dt_viz.ui.scene import palette
-from dt_viz.ui.scene.picture import Colour
+from dt_viz.ui.scene.palette import Colour
 from dt_viz.ui.scene.rollouts import manifold
 
 BASE = "Base attractor"

@@ -11,8 +11,7 @@ from dt_viz.scenario.scenario import View
 from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.session import Pace
 from dt_viz.ui.panel.verdict import Level, Verdict, concerns, shows_arm
-from dt_viz.ui.scene.palette import ink, paper
-from dt_viz.ui.scene.picture import Colour
+from dt_viz.ui.scene.palette import Colour, ink, paper
 from dt_viz.warning import in_millimetres
 
 CHANGED = "The scene is changed. “Reset” brings it back as it was."
