@@ -20,7 +20,7 @@ from dt_viz.session.session import Session
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.scene.camera import CameraController
 from dt_viz.ui.scene.legend import Legend
-from dt_viz.ui.scene.picture import Colour
+from dt_viz.ui.scene.palette import Colour
 from dt_viz.ui.tabs.about import Command, add_about, add_commands, numbered
 from dt_viz.ui.tabs.arm import add_arm, play_or_pause
 from dt_viz.ui.tabs.compare import ComparePanel

@@ -104,7 +104,7 @@ def test_the_ball_at_the_hand_holds_the_arm_where_it_is_dragged_and_lets_go(page
     told, live = [], page.visitor.robot.playback.live
     monkeypatch.setattr(live, "hold", told.append)
     monkeypatch.setattr(live, "release", lambda: told.append("released"))
-    monkeypatch.setattr(type(page.visitor.robot), "hand", np.array(MIDDLE))
+    monkeypatch.setattr(type(page.visitor.robot), "hand", None)
     (ball,) = (name for name in page.nodes if name.endswith("/grip"))
     page.visitor.robot.grip.visible = True
     dragged = [MIDDLE, (0.15, -0.5, 0.45), (0.2, -0.5, 0.3)]  # parallel to the slice

@@ -22,7 +22,7 @@ from dt_viz.scenario.scenario import View
 from dt_viz.session.engine import ArmMotion
 from dt_viz.session.frame import Frame
 from dt_viz.ui.scene.links import bodies, light_shells
-from dt_viz.ui.scene.palette import LIGHT, Colour, linear
+from dt_viz.ui.scene.palette import LIGHT, linear
 from dt_viz.ui.scene.picture import Following, Lines, Look, Picture, Shown, add_label
 from dt_viz.ui.scene.style import STYLES
 
@@ -99,9 +99,7 @@ class ArmPicture(ArmFrames):
 class GhostArm(Shown):
     """A translucent arm, such as that without avoidance; links that coincide with the arm's are hidden."""
 
-    def __init__(
-        self, scene: viser.SceneApi, robot: Robot, name: str = "/ghost_arm", colour: Colour = LIGHT.ghost
-    ) -> None:
+    def __init__(self, scene: viser.SceneApi, robot: Robot, name: str = "/ghost_arm") -> None:
         """Make the arm, hidden, under a name in the scene tree."""
         self._robot = robot
         self._tree = ArmFrames(scene, robot, name)
@@ -114,7 +112,7 @@ class GhostArm(Shown):
                 f"{frame.name}/shell",
                 shell.vertices,
                 shell.faces,
-                color=colour,
+                color=STYLES.arm_ghost.on(LIGHT),
                 opacity=STYLES.arm_ghost.opacity,
                 cast_shadow=False,
                 receive_shadow=False,

@@ -92,7 +92,7 @@ class Drawing:
             "/board",
             np.zeros((4, 3), np.float32),
             np.array([[0, 1, 2], [0, 2, 3]]),
-            color=LIGHT.board,
+            color=STYLES.board.on(LIGHT),
             opacity=STYLES.board.opacity,
             side="double",
             cast_shadow=False,

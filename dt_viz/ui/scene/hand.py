@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from dt_viz.flows.fields import Array
 from dt_viz.robot.robot import Robot
 from dt_viz.session.frame import Frame
+from dt_viz.ui.gestures import Drag
 from dt_viz.ui.scene.markers import Draggable, Marker
 from dt_viz.ui.scene.palette import Theme
 from dt_viz.ui.scene.picture import Lines, Look, Shown, add_ball, add_label, assign
@@ -27,10 +28,9 @@ class _HandMarker(Marker):
         super().__init__(group, ball, ball)
         self._where = where
 
-    @property
-    def position(self) -> Array:
+    def _stands(self, drag: Drag) -> Array:
         hand = self._where()
-        return super().position if hand is None else hand
+        return drag.grabbed if hand is None else hand
 
     def stand(self, position: ArrayLike, wxyz: ArrayLike | None = None) -> None:
         pass

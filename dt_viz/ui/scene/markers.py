@@ -117,6 +117,10 @@ class Marker:
         self.node._impl.position, self.node._impl.wxyz = np.full(3, np.nan), np.full(4, np.nan)
         self.node.position, self.node.wxyz = self._position, self._wxyz
 
+    def _stands(self, drag: Drag) -> Array:
+        """Return where the thing stands when a drag begins, (3,), metres."""
+        return self.position
+
     def _dragged(self, drag: Drag) -> None:
         """Move parallel to the slice.
 
@@ -126,7 +130,8 @@ class Marker:
         if drag.phase == "start":
             self._group.grabbed(self)
         if drag.phase == "start" or self._drag is None:
-            self._drag, self._asked = (drag.grabbed, self.position), self.position
+            self._asked = self._stands(drag)
+            self._drag = drag.grabbed, self._asked
         grabbed, stood = self._drag
         place = gestures.place(stood + in_slice(self._group.area, drag.camera, grabbed, drag.pointer))
         self._asked = self._asked if place is None else place

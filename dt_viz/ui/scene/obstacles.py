@@ -38,8 +38,8 @@ class ObstacleMarker(Marker):
         """Draw nothing yet; `index` is that of the obstacle in the scenario."""
         scene, node = group.scene, f"/obstacles/{index}"
         gizmo = scene.add_transform_controls(node, line_width=3.0, depth_test=False)
-        nothing = np.zeros((3, 3), np.float32), np.array([[0, 1, 2]], np.uint32)
-        self.mesh = scene.add_mesh_simple(f"{node}/surface", *nothing, color=LIGHT.obstacle, opacity=0.8)
+        style, nothing = STYLES.obstacle, (np.zeros((3, 3), np.float32), np.array([[0, 1, 2]], np.uint32))
+        self.mesh = scene.add_mesh_simple(f"{node}/surface", *nothing, color=style.on(LIGHT), opacity=style.opacity)
         self._shape: Obstacle | None = None
         super().__init__(group, gizmo, self.mesh, key=index, scale=0.2)
 

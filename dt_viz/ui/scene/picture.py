@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from dt_viz.flows.fields import Array
 from dt_viz.session.engine import ArmMotion
 from dt_viz.session.frame import Frame
-from dt_viz.ui.scene.palette import LIGHT, Colour, Theme, linear
+from dt_viz.ui.scene.palette import LIGHT, Theme, linear
 from dt_viz.ui.scene.style import ArrowStyle, BallStyle, LineStyle
 from dt_viz.ui.scene.tubes import RolloutTubes
 
@@ -151,11 +151,6 @@ def assign(node: Any, points: Array, colours: NDArray[np.uint8]) -> None:  # noq
     node.colors = colours if len(colours) else np.zeros(3, np.uint8)
 
 
-def rgb(colour: Colour, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    """Return one colour, as linear light, for an array of points of this shape."""
-    return np.broadcast_to(np.array(linear(colour), dtype=np.uint8), shape)
-
-
 class Arrows:
     """Vectors at points, the larger the longer and nearer to the strong colour."""
 
@@ -165,7 +160,7 @@ class Arrows:
         self.node = scene.add_arrows(
             name,
             np.zeros((1, 2, 3), np.float32),
-            rgb(getattr(LIGHT, style.weak), (1, 3)),
+            np.array([style.on(LIGHT)], np.uint8),
             shaft_radius=0.0011 * style.thickness,
             head_radius=0.0034 * style.thickness,
             head_length=0.0085 * style.thickness,
@@ -178,9 +173,7 @@ class Arrows:
         relative = np.minimum(size / np.quantile(size, 0.9), 1) if len(size) else size
         arrows = vectors / np.maximum(size, 1e-12) * self._style.length * (0.45 + 0.55 * relative)
         ends = np.stack([points - arrows / 2, points + arrows / 2], axis=1)
-        weak, strong = (
-            np.array(linear(getattr(theme, name)), float) for name in (self._style.weak, self._style.strong)
-        )
+        weak, strong = (np.array(linear(c)) for c in (getattr(theme, self._style.weak), self._style.on(theme)))
         assign(self.node, ends, (weak + relative * (strong - weak)).astype(np.uint8))
 
 
@@ -199,4 +192,4 @@ def add_label(
 
 def add_ball(scene: viser.SceneApi, name: str, style: BallStyle, **options: Any) -> viser.IcosphereHandle:  # noqa: ANN401
     """Add the ball that marks a place, with viser's further options."""
-    return scene.add_icosphere(name, radius=style.radius, color=getattr(LIGHT, style.colour), **options)
+    return scene.add_icosphere(name, radius=style.radius, color=style.on(LIGHT), **options)

@@ -8,13 +8,10 @@ from dt_viz.ui.scene.palette import Colour, Theme
 
 
 @dataclass(frozen=True)
-class LineStyle:
-    """Look of lines."""
+class Style:
+    """Look of something of one colour."""
 
     colour: str
-    width: float
-    dash: float = 0.0
-    """Length of a dash and of the gap after it; 0 draws through."""
 
     def on(self, theme: Theme, number: int = 0) -> Colour:
         """Return the colour in a theme; `number` tells those apart of which the theme has several of the name."""
@@ -23,10 +20,18 @@ class LineStyle:
 
 
 @dataclass(frozen=True)
-class TubeStyle:
+class LineStyle(Style):
+    """Look of lines."""
+
+    width: float
+    dash: float = 0.0
+    """Length of a dash and of the gap after it; 0 draws through."""
+
+
+@dataclass(frozen=True)
+class TubeStyle(Style):
     """Look of paths as tubes."""
 
-    colour: str
     radius: float
     ball: float = 0.0
     """Radius of a ball at the beginning; 0 makes none."""
@@ -34,11 +39,11 @@ class TubeStyle:
 
 
 @dataclass(frozen=True)
-class ArrowStyle:
-    """Look of vectors: the larger, the longer and nearer to the colour of the strongest."""
+class ArrowStyle(Style):
+    """Look of vectors: the larger, the longer and nearer to their colour."""
 
     weak: str
-    strong: str
+    """Colour of the shortest."""
     length: float
     """Length of the longest."""
     thickness: float = 1.0
@@ -46,18 +51,16 @@ class ArrowStyle:
 
 
 @dataclass(frozen=True)
-class BallStyle:
+class BallStyle(Style):
     """Look of a ball that marks a place."""
 
-    colour: str
     radius: float
 
 
 @dataclass(frozen=True)
-class SurfaceStyle:
+class SurfaceStyle(Style):
     """Look of a body that is not opaque."""
 
-    colour: str
     opacity: float
 
 
@@ -94,10 +97,10 @@ class Styles:
     panel_rollout: TubeStyle = TubeStyle("rollout", 0.0022, ball=0.0055)
 
     # vectors
-    field: ArrowStyle = ArrowStyle("arrow_slow", "arrow_fast", 0.024)
+    field: ArrowStyle = ArrowStyle("arrow_fast", "arrow_slow", 0.024)
     streamline_head: ArrowStyle = ArrowStyle("streamline", "streamline", 0.012)
-    generator: ArrowStyle = ArrowStyle("generator_weak", "generator", 0.030, thickness=1.25)
-    panel_generator: ArrowStyle = ArrowStyle("generator_weak", "generator", 0.030)
+    generator: ArrowStyle = ArrowStyle("generator", "generator_weak", 0.030, thickness=1.25)
+    panel_generator: ArrowStyle = ArrowStyle("generator", "generator_weak", 0.030)
 
     # places
     goal: BallStyle = BallStyle("goal", 0.012)

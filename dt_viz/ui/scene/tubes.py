@@ -30,7 +30,7 @@ class Tubes:
         self.node = scene.add_mesh_simple(
             name,
             *_NOTHING,
-            color=getattr(LIGHT, style.colour),
+            color=style.on(LIGHT),
             opacity=style.opacity,
             cast_shadow=style.opacity is None,
         )
@@ -50,7 +50,7 @@ class Tubes:
         if len(faces) != len(self.node.faces):
             self.node.faces = np.asarray(faces, np.uint32)
         self.node.vertices = vertices.reshape(-1, 3).astype(np.float32)
-        self.node.color = getattr(theme, self._style.colour)
+        self.node.color = self._style.on(theme)
 
 
 _NOTHING = np.zeros((3, 3), np.float32), np.array([[0, 1, 2]])

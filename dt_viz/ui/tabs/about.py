@@ -12,7 +12,7 @@ import viser
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.scene import palette
-from dt_viz.ui.scene.picture import Colour
+from dt_viz.ui.scene.palette import Colour
 from dt_viz.ui.tabs.plots import small
 
 TITLE = "Diffeomorphic Transforms for Generalised Imitation Learning"

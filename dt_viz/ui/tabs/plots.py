@@ -16,8 +16,8 @@ from dt_viz.motion.profiles import Profiles
 from dt_viz.robot.robot import NUM_JOINTS, Robot
 from dt_viz.session.engine import ArmMotion
 from dt_viz.ui.scene import palette
-from dt_viz.ui.scene.palette import css
-from dt_viz.ui.scene.picture import Colour, Following, Shown
+from dt_viz.ui.scene.palette import Colour, css
+from dt_viz.ui.scene.picture import Following, Shown
 
 NUM_SAMPLES = 80
 """Number of samples of a curve over time, few enough to be sent during a drag."""

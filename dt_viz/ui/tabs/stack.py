@@ -34,7 +34,7 @@ from dt_viz.session.frame import Frame
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.scene import palette
-from dt_viz.ui.scene.picture import Colour
+from dt_viz.ui.scene.palette import Colour
 from dt_viz.ui.scene.rollouts import manifold
 from dt_viz.ui.tabs.plots import small
 from dt_viz.ui.tabs.settings import add_settings, settings_of_purpose
