@@ -29,7 +29,7 @@ from dt_viz.session.session import Session
 from dt_viz.ui.bindings import EDITS, Bindings
 from dt_viz.ui.controls import Control
 from dt_viz.ui.panel import ControlPanel
-from dt_viz.ui.scene.tripod import Tripod
+from dt_viz.ui.scene.camera import HOME, CameraController, Framing, view_of, window_size
 from dt_viz.ui.visitor import Visitor
 from dt_viz.warning import Severity
 
@@ -116,10 +116,15 @@ class CameraClient:
         asyncio.run(self._reported(self.camera))
 
 
+def camera_for(task: Any, camera: Any, view: str = HOME, hand: Any = None, **framing: Any) -> Any:
+    """Position and look-at of a view of a task in the window of a camera."""
+    return view_of(task, Framing(window_size(camera), **framing), view, hand=hand)
+
+
 def panel_of(server: viser.ViserServer, notify: Any = ignored) -> ControlPanel:
     """A panel without a page."""
-    tripod = Tripod(cast(Any, CameraClient()), lambda: None)
-    return ControlPanel(server.gui, TITLES, load_jaco(), ignored, notify, tripod, ignored)
+    camera = CameraController(cast(Any, CameraClient()), lambda: None)
+    return ControlPanel(server.gui, TITLES, load_jaco(), ignored, notify, camera, ignored)
 
 
 class NoFrames:

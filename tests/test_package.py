@@ -17,7 +17,7 @@ from chromium import needs_chromium
 from PIL import Image
 from playwright.sync_api import TimeoutError as BrowserTimeoutError
 
-from dt_viz.ui.scene.palette import ROLLOUT
+from dt_viz.ui.scene.palette import LIGHT
 
 ROOT = Path(__file__).parents[1]
 PATIENCE = 300.0
@@ -127,7 +127,7 @@ def see_the_motion(browser, address, patience):
 
 def num_rollout_pixels(screenshot):
     pixels = np.asarray(Image.open(io.BytesIO(screenshot)).convert("RGB")).astype(int)
-    return (np.abs(pixels - ROLLOUT).max(axis=-1) < 20).sum()
+    return (np.abs(pixels - LIGHT.rollout).max(axis=-1) < 20).sum()
 
 
 def test_the_wheel_holds_the_modules_and_the_files_that_they_read_and_nothing_else(wheel):

@@ -18,9 +18,9 @@ from dt_viz.session.frame import Frame
 from dt_viz.session.progress import Message, Progress
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import Bindings
+from dt_viz.ui.scene.camera import CameraController
 from dt_viz.ui.scene.legend import Legend
-from dt_viz.ui.scene.picture import Colour
-from dt_viz.ui.scene.tripod import Tripod
+from dt_viz.ui.scene.palette import Colour
 from dt_viz.ui.tabs.about import Command, add_about, add_commands, numbered
 from dt_viz.ui.tabs.arm import add_arm, play_or_pause
 from dt_viz.ui.tabs.compare import ComparePanel
@@ -48,7 +48,7 @@ class ControlPanel:
         robot: Robot,
         save_png: Callable[[str, bool], None],
         notify: Callable[[str, Colour], None],
-        tripod: Tripod,
+        tripod: CameraController,
         darken: Callable[[bool], None],
     ) -> None:
         """Build the controls; they act once `connect` has given them a session.
@@ -66,7 +66,7 @@ class ControlPanel:
         self._notified: Message | None = None
         self._scenes = {scene.title: scene for scene in offered(self._titles)}
         self.bindings = bindings = Bindings()
-        self.presentation = Presentation(gui, self._turn, partial(setattr, tripod, "alone"))
+        self.presentation = Presentation(gui, self._turn, lambda alone: tripod.reframe(alone=alone))
         bindings.show(self._title, self.presentation.entitle)
         big = BigType(gui, tripod)
         self._add_choices(gui)

@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 
 from dt_viz.flows.fields import Array
+from dt_viz.metrics import interpolate
 from dt_viz.session.engine import ArmMotion
 from dt_viz.session.jobs import Jobs
 from dt_viz.session.robot_loop import LiveArm, RoundSettings
@@ -22,15 +23,6 @@ SHORTEST, LONGEST = 1 / 20, 1 / 6
 """Bounds of the time from one picture of the arm to the next, seconds."""
 PART = 1 / 12
 """Part of that time that moving and drawing the arm takes, at most: the more visitors there are, the fewer pictures."""
-
-
-def at_moment(motion: ArmMotion, moment: float) -> tuple[Array, Array]:
-    """Return the joint angles (6,), rad, with and without avoidance at a moment, seconds after the start."""
-    place = float(np.interp(moment, motion.times, np.arange(len(motion.times))))
-    before = min(int(place), len(motion.times) - 2)
-    weight = place - before
-    q, without = ((1 - weight) * path[before] + weight * path[before + 1] for path in (motion.q, motion.without))
-    return q, without
 
 
 class Replay:
@@ -55,19 +47,19 @@ class Replay:
         return 0.0 if self.motion is None else max(0.0, self._moment(self.motion) - self.motion.times[-1])
 
     @property
-    def posture(self) -> tuple[Array, Array] | None:
-        """The joint angles (6,) now, rad, with and without avoidance; None before there is a motion."""
-        return None if self.motion is None else at_moment(self.motion, self._moment(self.motion))
-
-    @property
     def q(self) -> Array | None:
-        """The former."""
-        return self.posture and self.posture[0]
+        """Joint angles (6,) now, rad; None before there is a motion."""
+        motion = self.motion
+        return None if motion is None else self._now(motion, motion.q)
 
     @property
     def undisturbed(self) -> Array | None:
-        """The latter."""
-        return self.posture and self.posture[1]
+        """The same of the motion without avoidance."""
+        motion = self.motion
+        return None if motion is None else self._now(motion, motion.without)
+
+    def _now(self, motion: ArmMotion, path: Array) -> Array:
+        return interpolate(np.array([self._moment(motion)]), motion.times, path)[0]
 
     def _moment(self, motion: ArmMotion) -> float:
         """Time in the loop, seconds."""
@@ -85,8 +77,8 @@ class Playback:
             draw: draws the arm in its posture.
         """
         self.live, self.replay = live, Replay()
-        self._arm: LiveArm | Replay = live
-        """The one of them that is shown."""
+        self.arm: LiveArm | Replay = live
+        """What moves now, with its joint angles `q` and `undisturbed`, (6,), rad, and the time since it `arrived`."""
         self._draw = draw
         self._playing, self._speed = True, 1.0
 
@@ -99,21 +91,6 @@ class Playback:
         """
         jobs.submit(LANE, partial(self._loop, jobs, fail))
 
-    @property
-    def q(self) -> Array | None:
-        """Joint angles (6,) of the arm now, rad; None before there is a motion."""
-        return self._arm.q
-
-    @property
-    def without(self) -> Array | None:
-        """The same at this moment of the motion without avoidance."""
-        return self._arm.undisturbed
-
-    @property
-    def arrived(self) -> float:
-        """Time since the arm came to the goal, seconds; 0 before."""
-        return self._arm.arrived
-
     def play(self, playing: bool, speed: float, *, replays: bool) -> None:
         """Choose how the arm moves.
 
@@ -122,14 +99,14 @@ class Playback:
             speed: its time, relative to real time.
             replays: whether it repeats its motion; when it does so no more, it goes on from where it is.
         """
-        left = self._arm.q
-        if self._arm is self.replay and not replays and left is not None:
+        left = self.arm.q
+        if self.arm is self.replay and not replays and left is not None:
             self.live.put(left)
-        self._playing, self._speed, self._arm = playing, speed, self.replay if replays else self.live
+        self._playing, self._speed, self.arm = playing, speed, self.replay if replays else self.live
 
     def advance(self, seconds: float) -> None:
         """Let some real time pass, in seconds, and have the arm drawn; called by one thread only."""
-        self._arm.advance(self._speed * seconds, moves=self._playing)
+        self.arm.advance(self._speed * seconds, moves=self._playing)
         self._draw()
 
     def _loop(self, jobs: Jobs, fail: Callable[[Exception], None]) -> None:

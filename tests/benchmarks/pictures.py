@@ -111,7 +111,7 @@ def _is_certified(visitor: Visitor) -> bool:
 
 def _stop_in_the_middle(visitor: Visitor) -> None:
     """Let the arm set out from a start, and stop it later."""
-    live, frame = visitor.playback.live, visitor.shown
+    live, frame = visitor.robot.playback.live, visitor.shown
     if frame is None or frame.arm is None or not frame.scenario.view.arm:
         return
     _until(lambda: live.phase is not Phase.MOVING)

@@ -24,6 +24,7 @@ from browsing import (
     wait_until,
 )
 from chromium import needs_chromium
+from pages import camera_for
 from PIL import Image
 from scenes import changing
 
@@ -33,7 +34,6 @@ from dt_viz.metrics import maximum_collision_distance
 from dt_viz.obstacles.shapes import MeshObstacle
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui.playback import Replay
-from dt_viz.ui.scene.camera import camera_for
 from dt_viz.ui.scene.slice_layers import VOLUME
 from dt_viz.ui.visitor import Visitor
 
@@ -132,14 +132,14 @@ def assert_shows_the_obstacle_where_it_is(visitor: Visitor) -> None:
     assert frame is not None
     assert frame.scenario.obstacle == session.scenario.obstacle
     (obstacle,) = session.scenario.obstacles
-    np.testing.assert_allclose(visitor.pictures.obstacles.items[0].gizmo.position, obstacle.position, atol=1e-9)
+    np.testing.assert_allclose(visitor.pictures.markers.obstacles.items[0].node.position, obstacle.position, atol=1e-9)
 
 
 def test_dragging_the_gizmo_moves_the_rollouts_clear_of_the_obstacle(visit):
     page, visitor = visit
     before = visitor.shown
     centre = np.array(visitor.session.scenario.obstacles[0].position)
-    tip = centre + np.array([0, 0, 0.8 * visitor.pictures.obstacles.items[0].gizmo.scale])
+    tip = centre + np.array([0, 0, 0.8 * visitor.pictures.markers.obstacles.items[0].node.scale])
     drag(page, project(page, visitor, tip), project(page, visitor, tip + np.array([0, 0, 0.06])))
     wait_until(lambda: visitor.session.scenario.obstacles[0].position[2] > centre[2] + 0.03, "the drag to arrive")
     assert visitor.session.wait_idle(PATIENCE)
@@ -211,11 +211,11 @@ def test_a_mesh_is_uploaded_in_its_own_unit_and_turned_by_its_handle(visit, monk
     (mesh,) = session.scenario.obstacles
     assert isinstance(mesh, MeshObstacle) and mesh.size == pytest.approx(0.15)
 
-    pictures = visitor.pictures.obstacles
-    wait_until(lambda: [item.handles.shown for item in pictures.items] == [True], "its handles")
+    pictures = visitor.pictures.markers.obstacles
+    wait_until(lambda: [item.has_handles for item in pictures.items] == [True], "its handles")
     (picture,) = pictures.items
     angles = itertools.cycle((0.8, 0.65, 0.5))  # where one try hits another handle the next does not
-    arc = 0.65 * picture.gizmo.scale  # the handles that turn are quarters of circles between the arrows
+    arc = 0.65 * picture.node.scale  # the handles that turn are quarters of circles between the arrows
 
     def turned():
         after = session.scenario.obstacles[0]
@@ -234,7 +234,7 @@ def test_a_mesh_is_uploaded_in_its_own_unit_and_turned_by_its_handle(visit, monk
     (after,) = session.scenario.obstacles
     axis = np.abs(after.wxyz[1:]) / np.linalg.norm(after.wxyz[1:])
     np.testing.assert_allclose(axis, [0, 1, 0], atol=1e-3)  # across the drawing plane
-    np.testing.assert_allclose(picture.gizmo.wxyz, after.wxyz, atol=1e-9)
+    np.testing.assert_allclose(picture.node.wxyz, after.wxyz, atol=1e-9)
 
 
 def test_the_saved_png_has_the_chosen_size_and_is_not_blank(visit):
@@ -306,7 +306,7 @@ def test_the_layers_of_the_whole_arm_are_seen_once_they_are_switched_on(visit, m
     wait_until(lambda: visitor.shown.arm is not None and session.wait_idle(0.2), "a motion")
     q = visitor.shown.arm.q[50]
     monkeypatch.setattr(Replay, "posture", property(lambda _: (q, q + 0.6 * np.eye(6)[0])))
-    wait_until(lambda: np.array_equal(visitor.playback.q, q), "the arm to be posed")
+    wait_until(lambda: np.array_equal(visitor.robot.playback.arm.q, q), "the arm to be posed")
     open_tab(page, "Show")
     until_drawn(visitor)
     before = pixels(page)
@@ -354,21 +354,21 @@ def test_the_hand_is_dragged_in_a_pause_and_goes_on_to_the_goal_when_it_is_let_g
     session = visitor.session
     session.edit("test", **changing(session.scenario, obstacles=()), view=replace(LIGHT, arm=True))
     wait_until(lambda: session.wait_idle(0.3) and visitor.shown.scenario == session.scenario, "a motion")
-    assert visitor.grip.ball.visible
-    before = visitor._hand()
+    assert visitor.robot.grip.visible
+    before = visitor.robot.hand
 
     def from_the_ball():
         x, y = project(page, visitor, before)
         return (x, y), (x - 50, y - 40)
 
-    drag_until(page, visitor, lambda: np.linalg.norm(visitor._hand() - before) > 0.02, lambda: None, from_the_ball)
-    live = visitor.playback.live
+    drag_until(page, visitor, lambda: np.linalg.norm(visitor.robot.hand - before) > 0.02, lambda: None, from_the_ball)
+    live = visitor.robot.playback.live
     wait_until(lambda: live.phase is not Phase.HELD, "the hand to be where it was let go")
-    hand = visitor._hand()
+    hand = visitor.robot.hand
     assert np.linalg.norm(hand - before) > 0.05
     assert abs(hand[1] - before[1]) < 5e-3  # parallel to the drawing plane, y = const
     np.testing.assert_allclose(project(page, visitor, hand), from_the_ball()[1], atol=12)
     assert np.linalg.norm(live.ahead[0] - hand) < 0.02  # from here on
     session.edit("play", view=replace(LIGHT, arm=True, playing=True, speed=3.0))
-    wait_until(lambda: np.linalg.norm(visitor._hand() - visitor.shown.goal) < 5e-3, "the goal")
+    wait_until(lambda: np.linalg.norm(visitor.robot.hand - visitor.shown.goal) < 5e-3, "the goal")
     wait_until(lambda: live.phase is Phase.HOMING, "the next round")

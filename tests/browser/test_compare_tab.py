@@ -97,7 +97,7 @@ def test_methods_are_ticked_followed_and_shown_with_their_arm(opened, initial):
         time.sleep(0.5)
         if np.ptp([visitor.session.scenario.obstacles[0].position[2], sphere.position[2]]) > 0.05:
             break
-        visitor._tripod.view()
+        visitor._camera.view()
     assert visitor.session.wait_idle(PATIENCE)
     compared = {compared.method.title: compared.scores for compared in visitor.shown.comparison}
     wait_until(lambda: figures(page) == {title: read(scores) for title, scores in compared.items()}, "other figures")
@@ -105,9 +105,9 @@ def test_methods_are_ticked_followed_and_shown_with_their_arm(opened, initial):
     assert moved["Ours"] != found["Ours"] and moved["EFlow"][1] != found["EFlow"][1]
     assert moved["EFlow"][0] == found["EFlow"][0]  # it does not avoid
 
-    assert not visitor.their_arm._ghost.visible
+    assert not visitor.robot.their_arm._ghost.visible
     press(page.get_by_label("Their arm", exact=True))
     page.get_by_role("option", name="EFlow", exact=True).evaluate("element => element.click()")
-    wait_until(lambda: visitor.their_arm._ghost.visible, "their arm")
+    wait_until(lambda: visitor.robot.their_arm._ghost.visible, "their arm")
     until_drawn(visitor)
     assert [text for text in warnings if not any(known in text for known in OF_OTHERS)] == []

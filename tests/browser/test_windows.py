@@ -21,10 +21,10 @@ from browsing import (
     wait_until,
 )
 from chromium import needs_chromium
+from pages import camera_for
 
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui.ruler import STEP
-from dt_viz.ui.scene.camera import camera_for
 from dt_viz.ui.tabs.picture import LARGER
 
 PHONE, PROJECTOR, LAPTOP, PHONE_ON_ITS_SIDE = (390, 844), (1920, 1080), (1280, 720), (844, 390)
@@ -185,7 +185,7 @@ def test_a_touch_drags_the_sphere(visit):
 
     for _ in range(TRIES):  # a page drawn by software may not show the sphere in its place yet
         begin(visitor, grabbed)
-        visitor._tripod.view()
+        visitor._camera.view()
         wait_until(lambda: np.abs(camera.position - home).max() < 1e-3, "the camera to be back")
         until_drawn(visitor)
         begun = np.array(project(page, visitor, before.position))
@@ -207,13 +207,13 @@ def test_a_touch_drags_the_sphere(visit):
 @pytest.mark.parametrize("ratio", [2, 3])
 def test_the_view_fits_the_window_whatever_pixels_the_screen_has(browser, server, ratio):
     page, visitor = open_page(browser, server, PHONE, ratio)
-    tripod, camera = visitor._tripod, visitor.client.camera
+    controller, camera = visitor._camera, visitor.client.camera
     for width, height in (PHONE, PHONE_ON_ITS_SIDE, PHONE):
         page.set_viewport_size({"width": width, "height": height})
         exact = camera_for(TASKS["draw_s"](), SimpleNamespace(image_width=width, image_height=height))
         near = 0.05 * np.linalg.norm(exact[0] - exact[1])
         wait_until(lambda: np.abs(camera.position - exact[0]).max() < near, "the camera's place")  # noqa: B023
-        wait_until(lambda: np.abs(np.divide(tripod.window, (width, height)) - 1).max() < STEP - 1, "its size")  # noqa: B023
+        wait_until(lambda: np.abs(np.divide(controller.framing.size, (width, height)) - 1).max() < STEP - 1, "its size")  # noqa: B023
         assert camera.image_width > 1.5 * width  # pixels of the screen, of which viser's page takes two at first
     close_page(page, server, visitor)
 

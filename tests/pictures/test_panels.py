@@ -17,8 +17,9 @@ from dt_viz.scenario.scenario import View
 from dt_viz.scenario.stack import IMITATION, plane_of, side_by_side, switched
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.frame import Stage
-from dt_viz.ui.scene import palette
+from dt_viz.ui.scene.palette import DARK, LIGHT
 from dt_viz.ui.scene.panels import Panels
+from dt_viz.ui.scene.picture import Look
 
 BIAS = "Bias 1"
 
@@ -155,29 +156,28 @@ def test_only_what_a_drag_changes_is_drawn_again(engine, initial, scene):
     shown = (*side_by_side(scenario), Panel("Avoidance"))
     x, y, z = scenario.obstacles[0].position
     panels = Panels(scene)
-    panels.draw(frame_of(engine, scenario, *shown))
-    before = [(nodes.streamlines.node.points, nodes.rollouts.node.vertices) for nodes in panels.panels]
-    panels.draw(frame_of(engine, changed(scenario, obstacles=(Sphere((x, y, z + 0.01), 0.15),)), *shown))
+    panels.draw(frame_of(engine, scenario, *shown), Look())
+    before = [(nodes.lines["streamlines"].node.points, nodes.rollouts.node.vertices) for nodes in panels.panels]
+    panels.draw(frame_of(engine, changed(scenario, obstacles=(Sphere((x, y, z + 0.01), 0.15),)), *shown), Look())
     same = [
-        nodes.streamlines.node.points is streamlines and nodes.rollouts.node.vertices is rollouts
+        nodes.lines["streamlines"].node.points is streamlines and nodes.rollouts.node.vertices is rollouts
         for nodes, (streamlines, rollouts) in zip(panels.panels, before, strict=True)
     ]
     assert same == [True, True, False, False, True]  # the bias is built below the avoidance, but for other samples
-    panels.draw(frame_of(engine, scenario, BASE_PANEL, field=False))
+    panels.draw(frame_of(engine, scenario, BASE_PANEL, field=False), Look())
     assert [nodes.frame.visible for nodes in panels.panels] == [True, True, False, False, False]
 
 
 def test_panels_take_the_theme_also_those_that_are_drawn_later(engine, initial, scene):
     panels, scenario = Panels(scene), biased(engine, initial)
     for dark, shown in ((True, [BASE_PANEL]), (False, [BASE_PANEL, Panel(BIAS)])):
-        panels.dye(dark)
-        panels.draw(frame_of(engine, scenario, *shown))
-        wanted = palette.shade(palette.STREAMLINE, dark)
-        assert {tuple(nodes.streamlines.colour) for nodes in panels.panels} == {wanted}
+        theme = DARK if dark else LIGHT
+        panels.draw(frame_of(engine, scenario, *shown), Look(theme))
+        assert {tuple(nodes.lines["streamlines"].node.colors) for nodes in panels.panels} == {theme.streamline}
 
 
 def test_rollouts_on_panels_are_grey_while_there_is_no_motion(engine, initial, scene):
     panels, frame = Panels(scene), frame_of(engine, biased(engine, initial), BASE_PANEL, Panel(IMITATION))
-    for blocked, colour in (((), palette.ROLLOUT), (("no way",), palette.STALE), ((), palette.ROLLOUT)):
-        panels.draw(replace(frame, blocked=blocked))
-        assert {tuple(nodes.rollouts.colour) for nodes in panels.panels} == {colour}
+    for theme, colour in ((LIGHT, LIGHT.rollout), (LIGHT.without_motion, LIGHT.stale), (LIGHT, LIGHT.rollout)):
+        panels.draw(frame, Look(theme))
+        assert {tuple(nodes.rollouts.node.color) for nodes in panels.panels} == {colour}

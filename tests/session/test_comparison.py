@@ -27,6 +27,7 @@ from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Stage
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.scene.comparison import APART, COLOURS, ComparedMotions, TheirArm
+from dt_viz.ui.scene.picture import Look
 from dt_viz.ui.tabs.compare import ComparePanel, _compare, _with_their_arm, hint, table_html
 
 LIVE, SLOW = "linear", "mpnet"
@@ -282,15 +283,15 @@ def test_motions_are_drawn_in_colours_of_their_own_with_names_apart(scene, besid
     assert set(COLOURS) == {method.name for method in OTHERS} and len(set(COLOURS.values())) == len(OTHERS)
     _, scenario, frames = beside
     picture = ComparedMotions(scene)
-    picture.draw(frames[-1])
+    picture.draw(frames[-1], Look())
     assert list(picture.motions) == [SLOW, LIVE]
     for name, motions in picture.motions.items():
         assert motions.node.visible
-        for lines in motions.lines.values():
-            np.testing.assert_array_equal(lines.colour, COLOURS[name])
+        for lines in (motions.followed, motions.others):
+            np.testing.assert_array_equal(lines.node.colors, COLOURS[name])
     apart = np.subtract(*(motions.label.position for motions in picture.motions.values()))
     assert np.linalg.norm(apart) > 0.8 * APART
-    picture.draw(frame_of(scenario, rollouts=frames[-1].rollouts, goal=frames[-1].goal))
+    picture.draw(frame_of(scenario, rollouts=frames[-1].rollouts, goal=frames[-1].goal), Look())
     assert not any(motions.node.visible for motions in picture.motions.values())
 
 
@@ -306,6 +307,6 @@ def test_their_arm_is_hidden_until_their_motion_is_known(scene, robot, beside):
         if frame.stage is Stage.LIVE:
             assert not arm._ghost.visible
     assert arm._ghost.visible
-    arm.pose(robot.home, 1.0, arrived=False)
+    arm.pose(0.0, robot.home, 1.0, sets_out=False)
     arm.show(False)
     assert not arm._ghost.visible

@@ -11,14 +11,15 @@ from viser import _messages as messages  # noqa: TID251
 from dt_viz.scenario.scenario import View
 from dt_viz.ui.bindings import KEEP
 from dt_viz.ui.controls import Control
-from dt_viz.ui.scene.handles import Handles
+from dt_viz.ui.scene.markers import Marker
+from dt_viz.ui.scene.picture import Look
 
 SCENARIO = avoiding("draw_s", ())
 
 
 @pytest.fixture(scope="module", name="page")
 def _page(page):
-    page.visitor.pictures.slice.draw(frame_of(page.busy(), task=page.session.task))
+    page.visitor.pictures.markers.slice.draw(frame_of(page.busy(), task=page.session.task), Look())
     return page
 
 
@@ -45,7 +46,7 @@ def updates(sent, handle):
 def echoes(request, monkeypatch):
     """Whether the page is one that echoes: what stands somewhere is put there again, and so is what has a value."""
     if request.param:
-        monkeypatch.setattr(Handles, "stand", lambda self, *_pose: self._put_back())
+        monkeypatch.setattr(Marker, "stand", lambda self, *_pose: self._put_back())
         monkeypatch.setattr(Control, "value", property(lambda self: self._value, lambda self, _value: self._put_back()))
     return request.param
 

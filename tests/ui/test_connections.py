@@ -458,4 +458,4 @@ async def test_a_browser_that_asks_for_the_picture_of_its_window_tells_its_width
             picture = f"http://127.0.0.1:{server.port}/window/{ruler.token}/390"
             with await asyncio.to_thread(urllib.request.urlopen, picture) as response:
                 assert (response.status, response.headers["Cache-Control"]) == (204, "no-store")
-            assert visitor._tripod.width == width
+            assert visitor._camera._width == width

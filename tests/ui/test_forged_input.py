@@ -18,11 +18,11 @@ from dt_viz.scenario.scenario import View
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui import controls, gestures
 from dt_viz.ui.panel import LANE
-from dt_viz.ui.scene import handles
-from dt_viz.ui.scene.camera import camera_for
+from dt_viz.ui.scene import markers
+from dt_viz.ui.scene.camera import view_of
 
 SCENES = offered(TASKS)
-BORDERS = {controls.__name__, gestures.__name__, handles.__name__}
+BORDERS = {controls.__name__, gestures.__name__, markers.__name__}
 UPLOAD = viser.GuiUploadButtonHandle
 FILE = viser.UploadedFile(name="x", content=b"\0" * 100)
 NO_NUMBERS = (math.nan, math.inf, -math.inf, 1e300, -1e300)
@@ -194,7 +194,7 @@ def test_a_gizmo_takes_no_turn_that_is_none(page, wxyz):
 
 def test_only_gizmos_that_are_shown_can_be_moved_and_those_can(page):
     before = page.busy(selected=1)
-    for name in ("/obstacles/0", "/obstacles/2", "/slice", "/bias/3"):
+    for name in ("/obstacles/0", "/obstacles/2", "/slice"):
         page.move(name, (0.2, -0.4, 0.3))
     assert page.session.scenario == before
     page.move("/obstacles/1", (0.2, -0.4, 0.3))
@@ -260,10 +260,10 @@ def test_a_ray_that_is_none_adds_no_start(page, ray):
 
 
 def test_reset_and_commands_bring_the_camera_back(page):
-    task, tripod = TASKS["draw_s"](), page.visitor._tripod
+    task, camera = TASKS["draw_s"](), page.visitor._camera
     page.busy()
     page.session.edit("warp", warp=0.5)
-    tripod.look(task)
+    camera.look(task)
     for act, view in (
         (lambda: page.claim(page["History"], "Undo"), None),
         (lambda: page.claim(page["History"], "Reset"), "Home"),
@@ -273,7 +273,7 @@ def test_reset_and_commands_bring_the_camera_back(page):
         page.camera.position, page.camera.look_at = np.full(3, 9.0), np.ones(3)
         act()
         seen = page.camera.position, page.camera.look_at
-        wanted = camera_for(task, page.camera, view, panel=tripod.panel) if view else (np.full(3, 9.0), np.ones(3))
+        wanted = view_of(task, camera.framing, view) if view else (np.full(3, 9.0), np.ones(3))
         np.testing.assert_array_equal(seen, wanted)
 
 
@@ -334,7 +334,7 @@ def test_a_switch_of_the_camera_and_its_command_are_one(page, command, label, na
         (lambda: page.claim(switch, False), False),
     ):
         act()
-        assert (getattr(page.visitor._tripod, name), switch.value) == (on, on)
+        assert (getattr(page.visitor._camera, name), switch.value) == (on, on)
 
 
 def test_a_command_that_is_forged_or_disabled_is_not_given(page):
@@ -359,7 +359,7 @@ def test_the_presentation_goes_from_scene_to_scene_and_folds_no_panel(page, monk
         return page.session.scenario.scene
 
     def is_on():
-        (on,) = {presentation.on, buttons.visible, page.visitor._tripod.alone}
+        (on,) = {presentation.on, buttons.visible, page.visitor._camera.framing.alone}
         return on
 
     (buttons,) = (handle for handle in page.inputs if handle.label == "Presentation" and hasattr(handle, "options"))

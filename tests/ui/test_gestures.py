@@ -29,11 +29,11 @@ SCENARIO = avoiding("draw_s", Sphere(TASKS["draw_s"]().obstacle_position), view=
 
 def test_a_click_on_an_obstacle_selects_it_and_shows_its_handles_and_another_hides_them(page):
     page.busy(selected=0)
-    items = page.visitor.pictures.obstacles.items
+    items = page.visitor.pictures.markers.obstacles.items
     for name, index, expected in (("/obstacles/2", 2, [0, 0, 1]), ("/obstacles/1", 1, [0, 1, 0]), ("", 1, [0, 0, 0])):
         page.click(f"{name or '/obstacles/1'}/surface")
         assert page.session.scenario.selected == index
-        assert [item.handles.shown for item in items] == expected
+        assert [item.has_handles for item in items] == expected
     assert page["Handles"].value is False
 
 
@@ -42,8 +42,8 @@ def test_delete_removes_the_selected_obstacle_and_its_handles(page):
     page.claim(page["Change"], "Delete")
     page.done()
     assert page.session.scenario.obstacles == (before[0], before[2])
-    items = page.visitor.pictures.obstacles.items
-    np.testing.assert_allclose([item.gizmo.position for item in items], [before[0].position, before[2].position])
+    items = page.visitor.pictures.markers.obstacles.items
+    np.testing.assert_allclose([item.node.position for item in items], [before[0].position, before[2].position])
     assert sorted(name for name in page.gizmos if name.startswith("/obstacles")) == ["/obstacles/0", "/obstacles/1"]
 
 
@@ -76,7 +76,7 @@ def test_the_slice_moves_along_the_arrow_that_is_dragged(drawn):
 
 @pytest.mark.parametrize("name", SWITCHED)
 def test_each_layer_is_shown_while_its_checkbox_is_on(drawn, name):
-    arms, show = drawn.visitor.arms, drawn.visitor._panel.show
+    arms, show = drawn.visitor.robot.arms, drawn.visitor._panel.show
     beside_layers = {"arm": arms.arm, "ghost_arm": arms.ghost, "body_points": arms.body}
     beside_layers |= {"joint_plots": show.joints, "health_plots": show.health}
     picture = beside_layers[name] if name in beside_layers else drawn.visitor.pictures.layer(name)
@@ -101,12 +101,12 @@ def shown_in(page, folder):
 
 def test_the_ball_at_the_hand_holds_the_arm_where_it_is_dragged_and_lets_go(page, monkeypatch):
     page.busy()
-    told, live = [], page.visitor.playback.live
+    told, live = [], page.visitor.robot.playback.live
     monkeypatch.setattr(live, "hold", told.append)
     monkeypatch.setattr(live, "release", lambda: told.append("released"))
-    monkeypatch.setattr(type(page.visitor), "_hand", lambda _: None)
+    monkeypatch.setattr(type(page.visitor.robot), "hand", None)
     (ball,) = (name for name in page.nodes if name.endswith("/grip"))
-    page.visitor.grip.ball.visible = True
+    page.visitor.robot.grip.visible = True
     dragged = [MIDDLE, (0.15, -0.5, 0.45), (0.2, -0.5, 0.3)]  # parallel to the slice
     for phase, end in zip(("start", "update", "end"), dragged, strict=True):
         page.drag(ball, MIDDLE, end, phase)
@@ -114,6 +114,6 @@ def test_the_ball_at_the_hand_holds_the_arm_where_it_is_dragged_and_lets_go(page
     np.testing.assert_allclose(places, dragged)
     assert released == "released"
     told.clear()
-    page.visitor.grip.ball.visible = False
+    page.visitor.robot.grip.visible = False
     page.drag(ball, MIDDLE, dragged[-1])
     assert told == []

@@ -12,7 +12,7 @@ from dt_viz.session.engine import ArmMotion
 from dt_viz.session.jobs import Jobs
 from dt_viz.session.robot_loop import RoundSettings
 from dt_viz.ui import playback as playback_module
-from dt_viz.ui.playback import Playback, at_moment
+from dt_viz.ui.playback import Playback, Replay
 
 PICTURE, REST = 0.02, RoundSettings().rest
 
@@ -51,8 +51,8 @@ class Player:
         self.playback, self.jobs = playback_of(self.arm, self.draw)
 
     def draw(self):
-        if self.playback.q is not None:
-            self.places.append(self.playback.q[0])
+        if self.playback.arm.q is not None:
+            self.places.append(self.playback.arm.q[0])
 
     def play(self, seconds):
         """The places where the arm is meanwhile."""
@@ -75,11 +75,14 @@ def player(monkeypatch):
     player.jobs.close()
 
 
-@pytest.mark.parametrize("moment", [0.0, 0.3, 1.7, 4.0, 9.0])
+@pytest.mark.parametrize("moment", [0.0, 0.3, 1.7, 4.0, 4.5])
 def test_both_arms_are_shown_at_the_same_moment(moment):
     times = np.linspace(0, 1, 60) ** 1.5 * 4
     motion = ArmMotion(times, np.sin(times)[:, None] * np.arange(6.0), np.cos(times)[:, None] * np.arange(6.0))
-    for got, path in zip(at_moment(motion, moment), (motion.q, motion.without), strict=True):
+    replay = Replay()
+    replay.motion = motion
+    replay.advance(moment)
+    for got, path in ((replay.q, motion.q), (replay.undisturbed, motion.without)):
         np.testing.assert_allclose(got, [np.interp(moment, times, angle) for angle in path.T], atol=1e-12)
 
 
@@ -142,7 +145,7 @@ def test_its_time_has_the_chosen_pace_and_a_pause_stops_it(player):
     player.playback.play(False, 2.0, replays=False)
     assert player.play(0.5)[-1] == pytest.approx(1.0)
     assert player.arm.asked[-1] == (pytest.approx(2 * PICTURE), False)  # it still hears that its hand is held
-    np.testing.assert_array_equal(player.playback.without, np.ones(6))
+    np.testing.assert_array_equal(player.playback.arm.undisturbed, np.ones(6))
 
 
 class TestReplay:
@@ -157,7 +160,7 @@ class TestReplay:
         assert max(places) == 4.0 and places[-1] == pytest.approx(3.4, abs=0.1)
         assert sum(place == 4.0 for place in places) * PICTURE == pytest.approx(REST, abs=2 * PICTURE)
         assert player.arm.asked == []
-        assert player.playback.without[0] == pytest.approx(player.playback.q[0] + 1)
+        assert player.playback.arm.undisturbed[0] == pytest.approx(player.playback.arm.q[0] + 1)
 
     def test_a_new_motion_takes_over_at_the_same_moment(self, player):
         player.play(0.2)
@@ -173,7 +176,7 @@ class TestReplay:
         rests = []
         for _ in range(200):
             player.play(PICTURE)
-            rests.append((player.places[-1], player.playback.arrived))
+            rests.append((player.places[-1], player.playback.arm.arrived))
         assert all((rest > 0) <= (place == 4.0) for place, rest in rests)
         assert REST - 2 * PICTURE < max(rest for _, rest in rests) <= REST
 
@@ -184,4 +187,8 @@ class TestReplay:
 
     def test_without_a_motion_nothing_is_posed(self, player):
         player.playback.replay.motion = None
-        assert player.playback.q is None and player.playback.without is None and player.playback.arrived == 0
+        assert (
+            player.playback.arm.q is None
+            and player.playback.arm.undisturbed is None
+            and player.playback.arm.arrived == 0
+        )

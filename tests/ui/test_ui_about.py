@@ -17,8 +17,8 @@ def test_the_paper_is_named_with_all_authors_and_a_link_that_opens_beside_the_pa
 def test_the_legend_has_each_colour_that_is_drawn_once():
     colours = re.findall(r"background:(rgb[^']*)'", legend_html())
     assert colours == [palette.css(colour) for colour in LEGEND.values()] and len(set(colours)) == len(colours)
-    wanted = {"DEMONSTRATION", "ROLLOUT", "GHOST", "OBSTACLE", "GOAL", "WAY"}
-    assert {getattr(palette, name) for name in wanted} <= set(LEGEND.values())
+    wanted = {"demonstration", "rollout", "ghost", "obstacle", "goal", "way"}
+    assert {getattr(palette.LIGHT, name) for name in wanted} <= set(LEGEND.values())
 
 
 def test_the_keys_are_those_of_the_commands():

@@ -6,27 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pages import camera_for
 
 from dt_viz.scenario.tasks import TASKS
-from dt_viz.ui.scene.camera import (
-    CAPTION,
-    FIELD_OF_VIEW,
-    HAND,
-    HOME,
-    MARGIN,
-    NARROW,
-    PANEL,
-    UNDER,
-    USUAL,
-    VIEWS,
-    axes,
-    camera_for,
-    framed,
-    free_part,
-    shown,
-    turned,
-    window,
-)
+from dt_viz.ui.scene.camera import HAND, HOME, VIEWS, Framing, axes, framed, places_of, turned, window_size
 
 
 def screen(size):
@@ -39,7 +22,7 @@ def pixels(points, position, look_at, size):
     right = np.cross(ahead, [0, 0, 1])
     right /= np.linalg.norm(right)
     seen = (points - position) @ np.stack([right, np.cross(ahead, right), ahead], axis=1)
-    focal = size[1] / 2 / np.tan(FIELD_OF_VIEW / 2)
+    focal = size[1] / 2 / np.tan(Framing.field_of_view / 2)
     return seen[:, :2] / seen[:, 2:] * focal + np.array(size) / 2, seen[:, 2]
 
 
@@ -49,11 +32,14 @@ def pixels(points, position, look_at, size):
 def test_a_task_is_seen_beside_the_panel_and_as_large_as_can_be(task, view, size):
     task = TASKS[task]()
     camera = screen(size)
-    at, depth = pixels(shown(task), *camera_for(task, camera, view), size)
-    narrow = size[0] < NARROW
-    low, high = np.zeros(2), np.array([size[0] - (0 if narrow else PANEL), size[1] * (1 - UNDER * narrow)])
+    at, depth = pixels(places_of(task), *camera_for(task, camera, view), size)
+    narrow = size[0] < Framing.narrow
+    low, high = (
+        np.zeros(2),
+        np.array(size) - [0 if narrow else Framing.panel, Framing.under * narrow * size[1]],
+    )
     assert depth.min() > 0.1
-    room = MARGIN * (high - low)
+    room = Framing.margin * (high - low)
     assert (at.min(axis=0) > low + room - 1).all() and (at.max(axis=0) < high - room + 1).all()
     empty = (high - low - 2 * room - np.ptp(at, axis=0)) / (high - low)
     assert empty.min() < 0.01
@@ -62,9 +48,9 @@ def test_a_task_is_seen_beside_the_panel_and_as_large_as_can_be(task, view, size
 @pytest.mark.parametrize("size", [(1600, 900), (390, 844), (844, 390)], ids=str)
 def test_a_presentation_shows_the_task_above_the_caption_in_all_of_the_width(size):
     task, camera = TASKS["draw_s"](), screen(size)
-    at, _ = pixels(shown(task), *camera_for(task, camera, alone=True), size)
-    high = np.array([size[0], size[1] * (1 - CAPTION)])
-    room = MARGIN * high
+    at, _ = pixels(places_of(task), *camera_for(task, camera, alone=True), size)
+    high = np.array([size[0], size[1] * (1 - Framing.caption)])
+    room = Framing.margin * high
     assert (at.min(axis=0) > room - 1).all() and (at.max(axis=0) < high - room + 1).all()
     assert (np.ptp(at, axis=0) > high - 2 * room - 2).any()
 
@@ -77,24 +63,24 @@ def test_the_hand_is_seen_from_near_in_the_middle_of_the_free_part_and_from_the_
     assert np.linalg.norm(near[0] - hand) < 0.8 * np.linalg.norm(home[0] - home[1])
     assert np.cross(near[1] - near[0], home[1] - home[0]) == pytest.approx(np.zeros(3), abs=1e-9)
     (at,), _ = pixels(np.array([hand]), *near, size)
-    assert at == pytest.approx([(size[0] - PANEL) / 2, size[1] / 2], abs=60)
+    assert at == pytest.approx([(size[0] - Framing.panel) / 2, size[1] / 2], abs=60)
 
 
 @pytest.mark.parametrize("size", [(1280, 720), (390, 844)], ids=str)
 def test_what_is_in_the_middle_of_the_free_part_stays_there_while_the_camera_turns(size):
     pose = np.array([0.8, -1.6, 0.8]), np.array([0.0, -0.3, 0.3])
-    across, upright = (tangents.mean() for tangents in free_part(size))
-    focal = size[1] / 2 / np.tan(FIELD_OF_VIEW / 2)
+    across, upright = (tangents.mean() for tangents in Framing(size).free)
+    focal = size[1] / 2 / np.tan(Framing.field_of_view / 2)
     middle = np.array(size) / 2 + focal * np.array([across, -upright])
     places = []
     for angle in (0.0, 0.4, 2.0, 2 * np.pi):
-        position, look_at = turned(pose, size, angle)
+        position, look_at = turned(pose, Framing(size), angle)
         ahead, right, up = axes(look_at - position)
         places.append(position + np.linalg.norm(look_at - position) * (ahead + across * right + upright * up))
         assert pixels(places[:1], position, look_at, size)[0] == pytest.approx(middle[None], abs=1e-6)
         assert position[2] == pose[0][2] and look_at[2] == pose[1][2]
     assert places == pytest.approx(np.tile(places[0], (4, 1)))
-    assert position == pytest.approx(pose[0]) and turned(pose, size, 1.0)[0] != pytest.approx(pose[0], abs=0.1)
+    assert position == pytest.approx(pose[0]) and turned(pose, Framing(size), 1.0)[0] != pytest.approx(pose[0], abs=0.1)
 
 
 @given(st.integers(0, 1000))
@@ -108,7 +94,7 @@ def test_no_camera_nearer_by_sees_all_points(seed):
 
     def sees_all(place):
         at, depth = pixels(points, place, place + ahead, (2, 2))
-        x, y = (at - 1).T * np.tan(FIELD_OF_VIEW / 2) * [[1], [-1]]
+        x, y = (at - 1).T * np.tan(Framing.field_of_view / 2) * [[1], [-1]]
         inside = [across[0] - 1e-9 <= x.min(), x.max() <= across[1] + 1e-9]
         return bool(depth.min() > 0 and all(inside) and upright[0] - 1e-9 <= y.min() and y.max() <= upright[1] + 1e-9)
 
@@ -119,4 +105,4 @@ def test_no_camera_nearer_by_sees_all_points(seed):
 
 @pytest.mark.parametrize("size", [(0, 0), (10, 720), (np.nan, 720), ("wide", 720), (10**9, 720), (None, None)])
 def test_a_size_that_no_window_has_is_not_believed(size):
-    assert window(screen(size)) == USUAL
+    assert window_size(screen(size)) == Framing.size

@@ -19,16 +19,13 @@ from dt_viz.scenario.scenario import View
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.engine import ArmMotion
 from dt_viz.session.frame import Stage
-from dt_viz.ui.scene.anchors import Anchors
-from dt_viz.ui.scene.arm import PEDESTAL, SEEN, ArmPicture
-from dt_viz.ui.scene.arm_layers import NUM_ARMS, Arms, Onion, arms_along, evenly_along
+from dt_viz.ui.scene.arm import NUM_ARMS, PEDESTAL, SEEN, ArmPicture, Arms, ArmSequence, arms_along
 from dt_viz.ui.scene.links import CELL, bodies, light_shells, simplified
-from dt_viz.ui.scene.obstacles import Obstacles
-from dt_viz.ui.scene.picture import Arrows, Lines
-from dt_viz.ui.scene.rollouts import Middles, Rollouts
+from dt_viz.ui.scene.palette import LIGHT
+from dt_viz.ui.scene.picture import Arrows, Lines, Look
+from dt_viz.ui.scene.rollouts import Rollouts
 from dt_viz.ui.scene.scene import OF_A_MOTION, OF_A_TASK, ScenePictures
-from dt_viz.ui.scene.slice import MovableSlice
-from dt_viz.ui.scene.starts import Starts
+from dt_viz.ui.scene.style import STYLES
 from dt_viz.ui.tabs.plots import NUM_SAMPLES, JointPlots, joint_curves
 from dt_viz.ui.tabs.show import IN_SCENE
 
@@ -51,11 +48,12 @@ def frame(arm=None, *, scenario=None, **changes):
 # --- Along the motion ---
 
 
-def test_a_path_that_rests_has_places_too():
-    path = np.repeat([[0.0, 0.0], [1.0, 0.0]], 5, axis=0)
-    places = evenly_along(path, 3)
-    assert places[0] == 0 and 4 < places[1] < 5 and places[2] == 9
-    assert np.isfinite(evenly_along(np.zeros((4, 3)), 3)).all()
+def test_a_motion_that_rests_has_arms_too():
+    q = np.repeat([ROBOT.home, REACHING], 5, axis=0)
+    first, middle, last = arms_along(ROBOT, ArmMotion(np.arange(10.0), q, q), 3)
+    np.testing.assert_allclose([first, last], [ROBOT.home, REACHING], atol=1e-9)
+    np.testing.assert_allclose(middle, (ROBOT.home + REACHING) / 2, atol=1e-6)
+    assert np.isfinite(arms_along(ROBOT, ArmMotion(np.arange(4.0), q[:4], q[:4]), 3)).all()
 
 
 def test_arms_go_from_start_to_goal_with_the_hand_in_equal_steps():
@@ -112,8 +110,8 @@ def world_pose(handles, index):
 
 def test_arms_along_the_motion_stand_where_the_arm_would(scene):
     """The arm is a tree of frames, those along the motion are placed in the world: both by the same kinematics."""
-    onion, arms, arm = Onion(scene, ROBOT), Arms(scene, ROBOT), motion()
-    onion.draw(frame(arm))
+    onion, arms, arm = ArmSequence(scene, ROBOT), Arms(scene, ROBOT), motion()
+    onion.draw(frame(arm), Look())
     onion.visible = True  # drawn while hidden: it catches up
     for which, q in enumerate(arms_along(ROBOT, arm)):
         arms.pose(q, q)
@@ -125,16 +123,16 @@ def test_arms_along_the_motion_stand_where_the_arm_would(scene):
 
 
 def test_arms_along_the_motion_send_nothing_while_hidden_and_follow_while_shown(scene):
-    onion = Onion(scene, ROBOT)
+    onion = ArmSequence(scene, ROBOT)
     before = onion.links[0].batched_positions.copy()
-    onion.draw(frame(motion()))
+    onion.draw(frame(motion()), Look())
     np.testing.assert_array_equal(onion.links[0].batched_positions, before)
     onion.visible = True
     earlier = onion.links[0].batched_wxyzs.copy()
-    onion.draw(frame(replace(motion(), q=motion().q + 0.2)))
+    onion.draw(frame(replace(motion(), q=motion().q + 0.2)), Look())
     shown = onion.links[0].batched_wxyzs.copy()
     assert np.abs(shown - earlier).max() > 0.05
-    onion.draw(frame(None))  # no motion: they stay
+    onion.draw(frame(None), Look())  # no motion: they stay
     np.testing.assert_array_equal(onion.links[0].batched_wxyzs, shown)
 
 
@@ -148,8 +146,8 @@ def test_body_points_move_with_the_arm_and_lines_say_from_where(scene):
         body.spheres.position + body.spheres.batched_positions, points.positions(ROBOT, q), atol=1e-6
     )
     np.testing.assert_allclose(np.asarray(body.spheres.batched_scales), points.radius, atol=1e-7)
-    np.testing.assert_allclose(body.paths.points[:, 0], points.positions(ROBOT, without), atol=1e-6)
-    np.testing.assert_allclose(body.paths.points[:, 1], points.positions(ROBOT, q), atol=1e-6)
+    np.testing.assert_allclose(body.paths.node.points[:, 0], points.positions(ROBOT, without), atol=1e-6)
+    np.testing.assert_allclose(body.paths.node.points[:, 1], points.positions(ROBOT, q), atol=1e-6)
     on_base, on_hand = body.spheres.batched_colors[points.joint < 0], body.spheres.batched_colors[points.joint == 5]
     assert (on_base == on_base[0]).all() and (on_hand != on_base[0]).any(axis=1).all()
 
@@ -173,24 +171,9 @@ def test_a_stale_arm_is_translucent_says_so_and_recovers(scene):
     assert not arm.stale and all(mesh.opacity is None for mesh in arm.meshes)
 
 
-def test_rollouts_of_another_scenario_are_grey_until_there_are_new_ones(scene):
-    rollouts = Rollouts(scene, Middles())
-    paths = tuple(np.linspace([x, 0.0, 0.0], [x, 1.0, 0.0], 5) for x in (0.0, 0.1))
-
-    def colours(blocked):
-        rollouts.draw(replace(frame(blocked=blocked), task=TASKS["draw_s"](), rollouts=paths))
-        return np.array([rollouts.hero.colour, rollouts.others.colour])
-
-    fresh, stale = colours(()), colours(("the obstacle touches the base",))
-    assert np.ptp(fresh, axis=1).min() > 60 and np.ptp(stale, axis=1).max() < 20
-    np.testing.assert_array_equal(colours(()), fresh)
-
-
 def scene_pictures(scene):
     """Everything in a scene, of which nothing that is dragged tells anyone."""
-    told = ignored, ignored, ignored
-    dragged = Obstacles(scene, *told), Anchors(scene, *told), MovableSlice(scene, ignored), Starts(scene, *told)
-    return ScenePictures(scene, ROBOT, *dragged)
+    return ScenePictures(scene, ROBOT, ignored)
 
 
 def test_what_lies_on_the_slice_is_hidden_while_it_belongs_to_another_motion(engine, initial, scene):
@@ -228,10 +211,23 @@ def drawn(engine, initial, scene):
     return pictures, scenario
 
 
+def test_rollouts_of_another_scenario_are_grey_until_there_are_new_ones(drawn):
+    pictures, _ = drawn
+    rollouts, last = cast(Rollouts, pictures.layer("rollouts")), pictures._frame
+
+    def colours(blocked):
+        pictures.draw(replace(last, blocked=blocked))
+        return np.array([rollouts.followed.node.color, rollouts.others.node.color])
+
+    fresh, stale = colours(()), colours(("the obstacle touches the base",))
+    assert np.ptp(fresh, axis=1).min() > 60 and np.ptp(stale, axis=1).max() < 20
+    np.testing.assert_array_equal(colours(()), fresh)
+
+
 def is_grey(pictures):
     rollouts = cast(Rollouts, pictures.layer("rollouts"))
     shown = {pictures.layer(name).visible for name in (*OF_A_MOTION, *OF_A_TASK)}
-    grey = bool(np.ptp(rollouts.hero.colour) < 20)
+    grey = bool(np.ptp(rollouts.followed.node.color) < 20)
     assert shown == {not grey}
     return grey
 
@@ -258,7 +254,7 @@ def test_lines_that_rollouts_cover_follow_a_drag_with_the_field(drawn, engine):
     pictures.draw(first)
     np.testing.assert_array_equal(demonstrations.points, before)
     pictures.draw(live)
-    covered = pictures.middles.beside(pictures.layer("demonstrations")._lines.segments(first.task.paths))
+    covered = pictures.look.tubes.outside(pictures.layer("demonstrations")._lines.segments(first.task.paths))
     assert len(demonstrations.points) == len(covered) and not np.array_equal(demonstrations.points, before)
 
 
@@ -286,11 +282,10 @@ def test_nothing_is_grey_while_something_is_dragged(drawn):
 
 @pytest.mark.parametrize("num", [0, 1, 5])
 def test_the_browser_gets_a_colour_for_each_arrow_and_of_none_a_single_one(scene, num):
-    lines = Lines(scene, "/lines", (10, 20, 30), 0.001)
-    arrows = Arrows(scene, "/arrows", (10, 20, 30), (40, 50, 60), 0.01)
+    lines, arrows = Lines(scene, "/lines", STYLES.ghost), Arrows(scene, "/arrows", STYLES.field)
     for _ in range(2):
-        lines.show_segments(np.ones((num, 2, 3)))
-        arrows.show(np.ones((num, 3)), np.ones((num, 3)))
+        lines.show_segments(np.ones((num, 2, 3)), LIGHT)
+        arrows.show(np.ones((num, 3)), np.ones((num, 3)), LIGHT)
         assert len(lines.node.points) == len(arrows.node.points) == num
         assert lines.node.colors.shape == (3,)
         assert arrows.node.colors.shape[0] == (num or 3)

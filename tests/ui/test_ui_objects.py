@@ -5,29 +5,41 @@ import pytest
 
 from dt_viz.robot.robot import load_jaco
 from dt_viz.scenario.tasks import POTS, TASKS
-from dt_viz.ui.scene.drawing import PERIOD, STEP, Drawing
-from dt_viz.ui.scene.objects import Objects
+from dt_viz.ui.scene.carried import INK_PERIOD, INK_STEP, Carried
+from dt_viz.ui.scene.palette import LIGHT
 
 ROBOT = load_jaco()
 DROP, PUSH, DRAW = (TASKS[name]() for name in ("drop_pots", "push_box", "draw_s"))
 LEFT, RIGHT = (np.array([POTS[k].x, POTS[k].y, 0.25]) for k in (0, 2))
 
 
+class Carrying:
+    """What is carried, and the hand that carries it."""
+
+    def __init__(self, scene):
+        self._carried = Carried(scene, "/hand", ROBOT.end_effector_offset)
+        self.objects, self.drawing = self._carried.objects, self._carried.drawing
+        self.stand, self.show = self._carried.stand, self._carried.show
+
+    def pose(self, hand, arrived, moment=0.0):
+        return self._carried.pose(moment, hand, arrived, LIGHT)
+
+
 @pytest.fixture
-def objects(scene):
-    return Objects(scene)
+def carrying(scene):
+    return Carrying(scene)
 
 
-def test_pots_are_drawn_for_tasks_that_have_some(objects):
-    objects.stand(DRAW)
-    assert objects.pots == ()
-    objects.stand(DROP)
-    assert [tuple(handle.position) for handle in objects.pots] == [(pot.x, pot.y, 0.0) for pot in POTS]
-    before = objects.pots
-    objects.stand(DROP)
-    assert objects.pots is before
-    objects.stand(DRAW)
-    assert objects.pots == ()
+def test_pots_are_drawn_for_tasks_that_have_some(carrying):
+    carrying.stand(DRAW)
+    assert carrying.objects.pots == ()
+    carrying.stand(DROP)
+    assert [tuple(handle.position) for handle in carrying.objects.pots] == [(pot.x, pot.y, 0.0) for pot in POTS]
+    before = carrying.objects.pots
+    carrying.stand(DROP)
+    assert carrying.objects.pots is before
+    carrying.stand(DRAW)
+    assert carrying.objects.pots == ()
 
 
 def test_pots_are_open_above():
@@ -38,87 +50,89 @@ def test_pots_are_open_above():
         assert over_the_opening.any() and middles[over_the_opening, 2].max() < 0.2 * pot.height
 
 
-def test_the_ball_is_shown_with_the_arm_once_the_hand_is_known(objects):
-    objects.stand(DROP)
-    ((_, ball),) = objects.items
+def test_the_ball_is_shown_with_the_arm_once_the_hand_is_known(carrying):
+    carrying.stand(DROP)
+    ((_, ball),) = carrying.objects.items
     assert not ball.visible
-    objects.pose(LEFT, 0.0)
+    carrying.pose(LEFT, 0.0)
     assert ball.visible
     np.testing.assert_allclose(ball.position, LEFT)
     for shown in (False, True):
-        objects.show(arm=shown)
+        carrying.show(arm=shown)
         assert ball.visible == shown
 
 
-def test_the_ball_stays_where_it_was_dropped_until_the_hand_sets_out_again(objects):
-    objects.stand(DROP)
-    ((thing, ball),) = objects.items
-    objects.pose(LEFT, 0.0)
+def test_the_ball_stays_where_it_was_dropped_until_the_hand_sets_out_again(carrying):
+    carrying.stand(DROP)
+    ((thing, ball),) = carrying.objects.items
+    carrying.pose(LEFT, 0.0)
     for hand, seconds in ((LEFT, 0.5), (RIGHT, 3.0)):  # the hand goes home
-        objects.pose(hand, seconds)
+        carrying.pose(hand, seconds)
         np.testing.assert_allclose(ball.position, thing.fallen(LEFT, seconds))
-    objects.pose(RIGHT, 0.0)
+    carrying.pose(RIGHT, 0.0)
     np.testing.assert_allclose(ball.position, RIGHT)
 
 
-def test_a_pushed_box_stays_at_the_goal_until_the_hand_sets_out_again(objects):
-    objects.stand(PUSH)
-    ((box, handle),) = objects.items
+def test_a_pushed_box_stays_at_the_goal_until_the_hand_sets_out_again(carrying):
+    carrying.stand(PUSH)
+    ((box, handle),) = carrying.objects.items
     np.testing.assert_array_equal(handle.position, box.start)
     path = PUSH.paths[0]
     for hand in path:
-        objects.pose(hand, 0.0)
+        carrying.pose(hand, 0.0)
     pushed = np.array(handle.position)
     assert np.linalg.norm(pushed - box.start) > 0.3
     for hand in path[::-1]:
-        objects.pose(hand, 1.0)
+        carrying.pose(hand, 1.0)
     np.testing.assert_array_equal(handle.position, pushed)
-    objects.pose(path[0], 0.0)
+    carrying.pose(path[0], 0.0)
     np.testing.assert_array_equal(handle.position, box.start)
 
 
 class TestDrawing:
     @pytest.fixture
-    def drawing(self, scene):
-        drawing = Drawing(scene, "/hand", ROBOT.end_effector_offset)
-        drawing.stand(DRAW)
-        return drawing
+    def carrying(self, scene):
+        carrying = Carrying(scene)
+        carrying.stand(DRAW)
+        return carrying
 
-    def drawn(self, drawing, path, arrived=0.0, begin=0.0):
+    def drawn(self, carrying, path, arrived=0.0, begin=0.0):
         for k, hand in enumerate(path):
-            drawing.pose(begin + PERIOD * 1.01 * k, hand, arrived)
-        return drawing.ink.node.points
+            carrying.pose(hand, arrived, begin + INK_PERIOD * 1.01 * k)
+        return carrying.drawing.ink.node.points
 
-    def test_the_pen_leaves_ink_where_it_touches_the_board_only(self, drawing):
+    def test_the_pen_leaves_ink_where_it_touches_the_board_only(self, carrying):
         path = np.array(DRAW.paths[0])
         lifted = slice(len(path) // 3, len(path) // 2)
         path[lifted] += 0.05 * DRAW.slice.normal
-        ink = self.drawn(drawing, path)
+        ink = self.drawn(carrying, path)
         assert len(ink) > len(path) / 3
         inside = DRAW.paths[0][lifted][5:-5]
-        assert np.linalg.norm(ink.mean(axis=1)[:, None] - inside, axis=2).min() > STEP
-        assert np.linalg.norm(ink[:, 1] - ink[:, 0], axis=1).max() < 3 * STEP
+        assert np.linalg.norm(ink.mean(axis=1)[:, None] - inside, axis=2).min() > INK_STEP
+        assert np.linalg.norm(ink[:, 1] - ink[:, 0], axis=1).max() < 3 * INK_STEP
 
-    def test_the_board_is_wiped_when_the_hand_sets_out_again(self, drawing):
+    def test_the_board_is_wiped_when_the_hand_sets_out_again(self, carrying):
         path = DRAW.paths[0]
-        whole = len(self.drawn(drawing, path))
-        assert len(self.drawn(drawing, path[::-1], arrived=1.0, begin=100.0)) == whole  # on the way home
-        drawing.pose(300.0, path[0], 0.0)
-        assert len(drawing.ink.node.points) == 0
+        whole = len(self.drawn(carrying, path))
+        assert len(self.drawn(carrying, path[::-1], arrived=1.0, begin=100.0)) == whole  # on the way home
+        carrying.pose(path[0], 0.0, 300.0)
+        assert len(carrying.drawing.ink.node.points) == 0
 
-    def test_it_is_shown_with_the_arm_in_tasks_that_draw(self, drawing):
+    def test_it_is_shown_with_the_arm_in_tasks_that_draw(self, carrying):
+        drawing = carrying.drawing
+
         def shown():
             return [node.visible for node in (drawing._board, drawing._pen, drawing.ink.node)]
 
         assert shown() == [True] * 3
-        drawing.show(arm=False)
+        carrying.show(arm=False)
         assert shown() == [False] * 3
-        drawing.show(arm=True)
-        drawing.stand(PUSH)
+        carrying.show(arm=True)
+        carrying.stand(PUSH)
         assert shown() == [False] * 3
-        assert len(self.drawn(drawing, PUSH.paths[0])) == 0
+        assert len(self.drawn(carrying, PUSH.paths[0])) == 0
 
-    def test_the_pens_tip_is_the_end_effector(self, drawing):
-        vertices = drawing._pen.vertices
+    def test_the_pens_tip_is_the_end_effector(self, carrying):
+        vertices = carrying.drawing._pen.vertices
         assert np.linalg.norm(vertices - ROBOT.end_effector_offset, axis=1).min() < 1e-6
         assert np.abs(vertices[:, 2]).max() <= np.abs(ROBOT.end_effector_offset[2]) + 1e-6

@@ -20,8 +20,9 @@ from dt_viz.pictures.occupancy import occupancy_picture
 from dt_viz.pictures.sketchbook import Pictures
 from dt_viz.scenario.scenario import MAX_OBSTACLES, View
 from dt_viz.scenario.tasks import TASKS
-from dt_viz.ui.scene.handles import in_slice
+from dt_viz.ui.scene.markers import in_slice
 from dt_viz.ui.scene.obstacles import Obstacles, shaded
+from dt_viz.ui.scene.picture import Look
 from dt_viz.ui.scene.slice_layers import OccupancySlice
 from dt_viz.ui.tabs.world import SHAPES, add, add_obstacles, delete, duplicate, name_of, with_room
 from dt_viz.warning import Severity
@@ -38,7 +39,7 @@ CLOUD = CloudObstacle((-0.1, -0.5, 0.4), Cloud(POINTS[:600], np.linalg.norm(POIN
 
 @pytest.fixture
 def shown(server):
-    yield Obstacles(server.scene, ignored, ignored, ignored)
+    yield Obstacles(server.scene, ignored)
     server.scene.reset()
 
 
@@ -61,13 +62,13 @@ def test_the_scene_follows_the_scenario_whatever_comes_and_goes(shown):
         shown.adopt(scenario(*obstacles))
         assert len(shown.items) == len(obstacles)
         for item, obstacle in zip(shown.items, obstacles, strict=True):
-            np.testing.assert_allclose(item.gizmo.position, obstacle.position)
-            np.testing.assert_allclose(item.gizmo.wxyz, obstacle.wxyz)
-            placed = item.mesh.scale * item.mesh.vertices @ rotation(obstacle.wxyz).T + item.gizmo.position
+            np.testing.assert_allclose(item.node.position, obstacle.position)
+            np.testing.assert_allclose(item.node.wxyz, obstacle.wxyz)
+            placed = item.mesh.scale * item.mesh.vertices @ rotation(obstacle.wxyz).T + item.node.position
             is_rounded = isinstance(obstacle, MeshObstacle | CloudObstacle)
             rounding = 0.04 * obstacle.size if is_rounded else 1e-6  # by two thirds of a cell of the distances
             np.testing.assert_allclose(obstacle.signed_distance(placed), 0, atol=rounding)
-            assert item.gizmo.disable_rotations == isinstance(obstacle, Sphere)
+            assert item.node.disable_rotations == isinstance(obstacle, Sphere)
 
 
 def test_what_is_resized_is_not_sent_again(shown):
@@ -82,13 +83,13 @@ def test_what_is_resized_is_not_sent_again(shown):
 @pytest.mark.parametrize(("selected", "expected"), [(0, [1, 0, 0]), (1, [0, 1, 0]), (2, [0, 0, 1]), (7, [0, 0, 1])])
 def test_only_the_selected_obstacle_has_handles_and_none_in_a_picture(shown, selected, expected):
     def handles():
-        return [int(item.handles.shown) for item in shown.items]
+        return [int(item.has_handles) for item in shown.items]
 
     shown.adopt(scenario(*ALL, selected=selected))
     assert handles() == expected
     with shown.without_handles():
         assert handles() == [0, 0, 0]
-        assert all(item.gizmo.visible and item.mesh.visible for item in shown.items)
+        assert all(item.node.visible and item.mesh.visible for item in shown.items)
     assert handles() == expected
 
 
@@ -291,7 +292,7 @@ def test_the_map_is_painted_on_the_slice_the_right_way_up(server):
     picture, task = OccupancySlice(server.scene), TASKS["draw_s"]()
     ball = Sphere(as_point(task.slice.centre + task.slice.axes @ [0.08, 0.12]), 0.1)  # to the upper right
     made = occupancy_picture(task.slice, (ball,), coarse=True)
-    picture.draw(frame_of(scenario(ball), pictures=Pictures(occupancy=made)))
+    picture.draw(frame_of(scenario(ball), pictures=Pictures(occupancy=made)), Look())
     image = picture.image.handle
     assert image is not None
     painted = painted_at(image, task.slice.half_size, image.image[..., 3] > 190)

@@ -17,12 +17,13 @@ from dt_viz.scenario.scenario import View
 from dt_viz.scenario.slices import SlicePose
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.frame import Stage
-from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.colour_scale import NUM_SHADES, from_oklab, oklab, ramp
 from dt_viz.ui.scene.export import as_png
 from dt_viz.ui.scene.legend import OCCUPANCY, legend_of
 from dt_viz.ui.scene.obstacles import Obstacles
-from dt_viz.ui.scene.rollouts import Middles, Rollouts
+from dt_viz.ui.scene.palette import LIGHT, css
+from dt_viz.ui.scene.picture import Look
+from dt_viz.ui.scene.rollouts import Rollouts
 from dt_viz.ui.scene.slice import MovableSlice
 from dt_viz.ui.scene.slice_layers import (
     OPACITY,
@@ -34,7 +35,7 @@ from dt_viz.ui.scene.slice_layers import (
     painted,
     scale_of,
 )
-from dt_viz.ui.scene.tubes import NUM_SIDES
+from dt_viz.ui.scene.tubes import NUM_SIDES, RolloutTubes
 from dt_viz.ui.tabs.show import WHOLE_ARM_NOTE, SlicePanel
 
 SCENARIO = avoiding("draw_s", (Sphere((0.0, -0.5, 0.4)),))
@@ -59,29 +60,29 @@ def test_the_frame_lies_where_the_slice_does_and_only_while_it_is_of_use(scene):
     picture = MovableSlice(scene, ignored)
     picture.adopt(seen(move_slice=True))  # before the task is known
     assert not picture.visible
-    picture.draw(frame())
+    picture.draw(frame(), Look())
     for view, pose in (({"move_slice": True}, TASK.slice.pose), ({"slice": POSE}, POSE)):
         picture.adopt(seen(**view))
         assert picture.visible
-        w, x, y, z = (float(c) for c in picture.gizmo.wxyz)
-        border = picture.border.node.points[:, 0] @ rotation((w, x, y, z)).T + picture.gizmo.position
+        w, x, y, z = (float(c) for c in picture.node.wxyz)
+        border = picture.border.node.points[:, 0] @ rotation((w, x, y, z)).T + picture.node.position
         np.testing.assert_allclose(border, TASK.slice.posed(pose).border[:-1], atol=1e-6)
-        assert (picture.gizmo.opacity > 0) == ("move_slice" in view)
+        assert (picture.node.opacity > 0) == ("move_slice" in view)
     picture.adopt(SCENARIO)
     assert not picture.visible
 
 
 def test_one_thing_at_a_time_has_handles_and_none_in_a_picture(scene):
-    picture, obstacles = MovableSlice(scene, ignored), Obstacles(scene, ignored, ignored, ignored)
-    picture.draw(frame())
+    picture, obstacles = MovableSlice(scene, ignored), Obstacles(scene, ignored)
+    picture.draw(frame(), Look())
     for moving in (True, False):
         for each in (picture, obstacles):
             each.adopt(seen(move_slice=moving, handles=True))
-        assert obstacles.items[0].handles.shown is not moving
+        assert obstacles.items[0].has_handles is not moving
     picture.adopt(seen(move_slice=True))
     with picture.without_handles():
-        assert picture.gizmo.opacity == 0 and picture.visible
-    assert picture.gizmo.opacity == 1
+        assert picture.node.opacity == 0 and picture.visible
+    assert picture.node.opacity == 1
 
 
 # --- What lies on it ---
@@ -93,8 +94,8 @@ def test_arrows_and_streamlines_show_what_they_are_given(scene):
     line = np.linspace([0.0, 0, 0], [0.3, 0, 0], 7)
     arrows, streams = FieldArrows(scene), Streamlines(scene)
     shown = frame(pictures=Pictures(field=FieldPicture(points, velocities), streamlines=(line, line + 1.0)))
-    arrows.draw(shown)
-    streams.draw(shown)
+    arrows.draw(shown, Look())
+    streams.draw(shown, Look())
     np.testing.assert_allclose(arrows.arrows.node.points.mean(axis=1), points, atol=1e-6)
     np.testing.assert_allclose(streams.lines.node.points[:6, 0], line[:-1], atol=1e-6)
     heads = streams.heads.node.points
@@ -102,7 +103,7 @@ def test_arrows_and_streamlines_show_what_they_are_given(scene):
     np.testing.assert_allclose(heads.mean(axis=1), [line[3], line[3] + 1.0], atol=1e-6)
     assert ((heads[:, 1] - heads[:, 0])[:, 0] > 0).all()  # the way that the motion goes
     before = streams.lines.node.points.copy()
-    streams.draw(frame())  # not worked out yet: they stay
+    streams.draw(frame(), Look())  # not worked out yet: they stay
     np.testing.assert_array_equal(streams.lines.node.points, before)
 
 
@@ -134,14 +135,14 @@ def test_colours_say_the_value_at_their_place():
     expected = VOLUME[np.round((np.clip(middle, -2, 2) + 2) / 4 * (NUM_SHADES - 1)).astype(int)]
     seen = on_white(pixels[:, 0])
     assert np.abs(seen - expected).max() <= 7
-    np.testing.assert_allclose(seen[[0, -1]], [palette.VOLUME[0], palette.VOLUME[-1]], atol=1.5)
+    np.testing.assert_allclose(seen[[0, -1]], [LIGHT.volume[0], LIGHT.volume[-1]], atol=1.5)
 
 
 def test_a_fold_jumps_out_and_nothing_is_shown_where_no_motion_comes():
     values, room = np.ones((21, 25)), np.full((21, 25), 0.1)
     values[:5], values[-5:], room[-5:] = -0.2, np.nan, -0.1
     pixels = painted(picture_of(values, clearance=room))
-    np.testing.assert_array_equal(pixels[2, 5], [*palette.FOLDED, 255])
+    np.testing.assert_array_equal(pixels[2, 5], [*LIGHT.folded, 255])
     assert pixels[-2, 5, 3] == 0
     middle = pixels[len(pixels) // 2, 5]
     assert on_white(middle).min() > 235 and middle[3] < 0.1 * 255  # det J = 1 has no colour, and veils nothing
@@ -154,10 +155,10 @@ def test_the_image_follows_the_slice(scene):
     corner[-3:, -3:] = 100.0  # far along both axes
     for pose in (None, POSE):
         area = TASK.slice.posed(pose)
-        shown.draw(frame(pictures=Pictures(colour=replace(picture_of(corner), area=area))))
+        shown.draw(frame(pictures=Pictures(colour=replace(picture_of(corner), area=area))), Look())
         handle = shown.image.handle
         assert handle is not None
-        dark = (np.abs(on_white(handle.image) - palette.VOLUME[-1]) < 2).all(axis=-1)
+        dark = (np.abs(on_white(handle.image) - LIGHT.volume[-1]) < 2).all(axis=-1)
         place = painted_at(handle, area.half_size, dark)
         assert (area.across(place) > 0.8 * np.array(area.half_size)).all()
         assert abs((place - area.centre) @ area.normal) < 1e-9
@@ -165,16 +166,16 @@ def test_the_image_follows_the_slice(scene):
 
 def test_rollouts_of_the_whole_stack_are_translucent_and_thinner_beside_a_level(scene):
     def widths():
-        meshes = (tubes.node.vertices for tubes in (rollouts.hero, rollouts.others))
+        meshes = (tubes.node.vertices for tubes in (rollouts.followed, rollouts.others))
         return [np.ptp(mesh[-2 * NUM_SIDES :, 1]) for mesh in meshes]  # at the end
 
-    rollouts = Rollouts(scene, Middles())
-    rollouts.draw(frame())
+    rollouts, look = Rollouts(scene), Look(tubes=RolloutTubes(frame().rollouts))
+    rollouts.draw(frame(), look)
     hero, others = widths()
     assert hero > others > 0
-    rollouts.draw(frame(level=0))
-    assert len(rollouts.hero.node.vertices) == 3 and widths()[1] < others
-    rollouts.draw(frame())
+    rollouts.draw(frame(level=0), look)
+    assert len(rollouts.followed.node.vertices) == 3 and widths()[1] < others
+    rollouts.draw(frame(), look)
     assert widths() == [hero, others]
 
 
@@ -185,7 +186,7 @@ def test_oklab_goes_round_and_steps_of_a_scale_look_equally_large():
     colours = np.random.default_rng(0).uniform(0, 255, (50, 3))
     np.testing.assert_allclose(from_oklab(oklab(colours)), colours, atol=1e-3)
     np.testing.assert_allclose(oklab(np.array([255.0, 255, 255])), [1, 0, 0], atol=1e-3)
-    for anchors in (palette.LYAPUNOV, palette.VOLUME):
+    for anchors in (LIGHT.lyapunov, LIGHT.volume):
         shades = ramp(anchors)
         np.testing.assert_array_equal(shades[[0, -1]], [anchors[0], anchors[-1]])
         steps = np.linalg.norm(np.diff(oklab(shades[::8].astype(float)), axis=0), axis=1)
@@ -193,7 +194,7 @@ def test_oklab_goes_round_and_steps_of_a_scale_look_equally_large():
 
 
 def test_the_lyapunov_value_grows_darker_and_one_has_no_colour():
-    lightness = oklab(ramp(palette.LYAPUNOV).astype(float))[:, 0]
+    lightness = oklab(ramp(LIGHT.lyapunov).astype(float))[:, 0]
     assert (np.diff(lightness) < 0.004).all() and lightness[0] - lightness[-1] > 0.6
     middle = oklab(VOLUME[NUM_SHADES // 2 - 1 : NUM_SHADES // 2 + 1].astype(float))
     assert np.abs(middle[:, 1:]).max() < 0.02
@@ -210,7 +211,7 @@ def test_the_legend_has_round_numbers_with_a_unit_that_reach_the_largest_value(l
 def test_the_legend_of_det_j_names_the_colour_of_folds():
     said = LEGENDS["det"].html
     assert all(f">{number}<" in said for number in ("0.01", "0.1", "1", "10", "100"))
-    assert "0 or less" in said and palette.css(palette.FOLDED) in said
+    assert "0 or less" in said and css(LIGHT.folded) in said
 
 
 LEGENDS = {

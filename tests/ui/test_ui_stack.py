@@ -16,8 +16,9 @@ from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.stack import IMITATION, WHOLE_ARM, anchored, avoiding_with, selected
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui.panel import add_avoid_and_imitate, avoids_with
-from dt_viz.ui.scene.anchors import Anchors
-from dt_viz.ui.scene.levels import LevelRollouts
+from dt_viz.ui.scene.bias_points import BiasPoints
+from dt_viz.ui.scene.picture import Look
+from dt_viz.ui.scene.rollouts import LevelRollouts
 from dt_viz.ui.scene.tubes import NUM_SIDES
 from dt_viz.ui.tabs.stack import (
     BASE,
@@ -136,11 +137,11 @@ def test_rows_are_reused_and_hidden_when_the_stack_shrinks(server):
 def test_the_selected_level_is_drawn_and_named(scene):
     picture = LevelRollouts(scene)
     for name, level in ((IMITATION, 0), ("Bias 2", 2), (AVOIDANCE, 3)):
-        picture.draw(frame(replace(SCENARIO, view=View(level=name)), level=level))
+        picture.draw(frame(replace(SCENARIO, view=View(level=name)), level=level), Look())
         assert picture.visible and name.lower() in picture.label.text.lower()
         middles = picture.tubes.node.vertices.reshape(-1, NUM_SIDES, 3).mean(axis=1)
         np.testing.assert_allclose(middles[-1], level, atol=1e-6)
-    picture.draw(frame())
+    picture.draw(frame(), Look())
     assert not picture.visible
 
 
@@ -155,7 +156,7 @@ def test_the_end_of_a_level_is_marked_where_it_is_not_the_goal(scene):
     picture = LevelRollouts(scene)
     seen = replace(SCENARIO, view=View(level="Bias 2"))
     for goal, marked in ((2.0, False), (2.1, True), (2.0, False)):
-        picture.draw(frame(seen, level=2, goal=np.full(3, goal)))
+        picture.draw(frame(seen, level=2, goal=np.full(3, goal)), Look())
         assert picture.end.visible == marked
         np.testing.assert_array_equal(picture.end.position, np.full(3, 2.0))
 
@@ -164,29 +165,28 @@ def test_the_end_of_a_level_is_marked_where_it_is_not_the_goal(scene):
 
 
 def test_bias_points_stand_where_they_are_and_the_one_that_was_clicked_has_handles(scene):
-    picture = Anchors(scene, ignored, ignored, ignored)
+    picture = BiasPoints(scene, ignored)
     picture.adopt(SCENARIO)
-    picture.draw(frame())
-    first, second, *others = picture.items
-    assert [item.gizmo.visible for item in picture.items] == [True, True, *[False] * len(others)]
+    picture.draw(frame(), Look())
+    first, second = picture.items
     for item, point in zip((first, second), anchored(SCENARIO).values(), strict=True):
-        np.testing.assert_allclose(item.gizmo.position, cast(Any, point).position)
-    assert first.gizmo.active_axes == (True, True, False)  # in the drawing's plane
-    assert second.gizmo.active_axes == (True, True, True)
-    assert (first.gizmo.opacity, second.gizmo.opacity) == (0.0, 0.0)
+        np.testing.assert_allclose(item.node.position, cast(Any, point).position)
+    assert first.node.active_axes == (True, True, False)  # in the drawing's plane
+    assert second.node.active_axes == (True, True, True)
+    assert (first.node.opacity, second.node.opacity) == (0.0, 0.0)
     assert not first.region.visible
     picture.adopt(replace(SCENARIO, view=View(bias_handles=True)))
-    assert (first.gizmo.opacity, second.gizmo.opacity) == (0.0, 1.0)  # the newest
+    assert (first.node.opacity, second.node.opacity) == (0.0, 1.0)  # the newest
     picture.adopt(replace(SCENARIO, view=View(bias="Bias 1", bias_handles=True)))
-    assert (first.gizmo.opacity, second.gizmo.opacity) == (1.0, 0.0)
+    assert (first.node.opacity, second.node.opacity) == (1.0, 0.0)
     with picture.without_handles():
-        assert first.gizmo.opacity == 0.0
-    assert first.gizmo.opacity == 1.0
+        assert first.node.opacity == 0.0
+    assert first.node.opacity == 1.0
     assert first.region.visible and np.ravel(first.region.scale)[0] == 0.2
     assert not np.any(first.region.points[..., 2]) and np.ptp(second.region.points, axis=(0, 1)).min() > 1.9
     assert not second.region.visible  # nobody knows how large
     picture.adopt(changed(SCENARIO, layers=()))
-    assert not any(item.gizmo.visible for item in picture.items)
+    assert picture.items == []
 
 
 def test_bias_points_are_added_changed_and_deleted():

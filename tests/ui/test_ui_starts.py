@@ -12,7 +12,8 @@ from dt_viz.motion.following import room_at_rest
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.scenario import MAX_STARTS, Start, View
 from dt_viz.scenario.starts import APART, INNER, followed, struck, with_grid, with_moved_start, with_start
-from dt_viz.ui.scene import palette
+from dt_viz.ui.scene.palette import LIGHT
+from dt_viz.ui.scene.picture import Look
 from dt_viz.ui.tabs.world import add_starts
 
 
@@ -87,7 +88,7 @@ def test_the_arm_follows_the_same_rollout_when_starts_are_added(engine, initial,
 def area(page):
     """The slice, of which the page knows."""
     task = page.session.task
-    page.visitor.pictures.starts.draw(frame_of(page.session.scenario, task=task))
+    page.visitor.pictures.markers.starts.draw(frame_of(page.session.scenario, task=task), Look())
     return task.slice
 
 
@@ -120,10 +121,11 @@ def test_balls_stand_where_the_starts_are_and_are_dragged_parallel_to_the_slice(
 
 def test_balls_are_grey_while_nothing_moves_from_them(page):
     page.begin(avoiding("draw_s", starts=starts_at((0.1, -0.5, 0.4), (0.2, -0.5, 0.4))))
-    starts, task = page.visitor.pictures.starts, page.session.task
-    for blocked, colour in ((("no way",), palette.STALE), ((), palette.ADDED)):
-        starts.draw(frame_of(page.session.scenario, task=task, blocked=blocked))
-        assert [item.ball.color for item in starts.items] == [colour] * 2
+    pictures, goal = page.visitor.pictures, np.zeros(3)
+    for blocked, colour in ((("no way",), LIGHT.stale), ((), LIGHT.added)):
+        scenario = page.session.scenario
+        pictures.draw(frame_of(scenario, task=page.session.task, blocked=blocked, goal=goal, reached=goal))
+        assert [item.node.color for item in pictures.markers.starts.items] == [colour] * 2
 
 
 def test_a_label_is_chosen_for_new_starts_and_for_the_one_that_the_arm_follows(server):

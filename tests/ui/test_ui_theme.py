@@ -1,11 +1,16 @@
 """The dark theme: what is drawn on it can be seen, and the light one comes back as it was."""
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 
-from dt_viz.ui.scene import palette
+from dt_viz.session.frame import Stage
+from dt_viz.session.session import Pace
+from dt_viz.ui.scene.palette import DARK, Theme
+from dt_viz.ui.scene.style import STYLES
 
-LINES = ("DEMONSTRATION", "ROLLOUT", "ADDED", "GHOST", "WAY", "GOAL", "OBSTACLE", "BIAS", "STREAMLINE", "ARROW_FAST")
+LINES = ("demonstration", "rollout", "added", "ghost", "way", "goal", "obstacle", "bias", "streamline", "arrow_fast")
 SEEN = 2.7
 """Smallest contrast with table and sky (WCAG 2.1 measures it so)."""
 
@@ -20,11 +25,16 @@ def contrast(one, other):
     return (high + 0.05) / (low + 0.05)
 
 
-@pytest.mark.parametrize("name", [*LINES, "GRID", "INK", "OUTLINE"])
+@pytest.mark.parametrize("name", [*LINES, "grid", "ink", "outline"])
 def test_lines_are_seen_on_the_dark_background(name):
-    colour = palette.shade(getattr(palette, name), dark=True)
-    for ground in (palette.ZENITH, palette.HORIZON, palette.TABLE):
-        assert contrast(colour, palette.shade(ground, dark=True)) >= SEEN
+    for ground in (DARK.zenith, DARK.horizon, DARK.table):
+        assert contrast(getattr(DARK, name), ground) >= SEEN
+
+
+def test_each_style_has_colours_that_all_themes_have():
+    names = {field.name for field in fields(Theme)}
+    for style in (getattr(STYLES, field.name) for field in fields(STYLES)):
+        assert {value for value in vars(style).values() if isinstance(value, str)} <= names
 
 
 def colours(page):
@@ -42,8 +52,13 @@ def choose(page, dark):
     page.done()
 
 
-def test_the_light_theme_comes_back_as_it_was(page, monkeypatch):
+@pytest.fixture(autouse=True)
+def _drawn(page, initial, at_rest):
     page.busy()
+    page.visitor.draw(at_rest(initial("draw_s"), Stage.LIVE), Pace(0.02, 10.0, 0))
+
+
+def test_the_light_theme_comes_back_as_it_was(page, monkeypatch):
     themes, before = [], colours(page)
     monkeypatch.setattr(page.gui, "configure_theme", lambda **theme: themes.append(theme["dark_mode"]))
     choose(page, True)

@@ -1,4 +1,4 @@
-"""Rollouts as tubes, what they cover, and how they fade where they jump."""
+"""Rollouts as tubes, and what they cover."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -12,9 +12,11 @@ from scipy.spatial import KDTree
 
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.tasks import TASKS
-from dt_viz.ui.scene import rollouts as rollouts_module
-from dt_viz.ui.scene.rollouts import COVERED, JUMP, OPACITY, SPARSE, Demonstrations, Ghost, Middles, Rollouts
-from dt_viz.ui.scene.tubes import NUM_RINGS, NUM_SIDES, Tubes, evenly_bent, tube_faces, tubes
+from dt_viz.ui.scene.palette import LIGHT
+from dt_viz.ui.scene.picture import Look
+from dt_viz.ui.scene.rollouts import Demonstrations, Ghost
+from dt_viz.ui.scene.style import TubeStyle
+from dt_viz.ui.scene.tubes import INSIDE, NUM_RINGS, NUM_SIDES, RolloutTubes, Tubes, evenly_bent, tube_faces, tubes
 
 RADIUS, BALL = 0.003, 0.007
 SCENARIO = avoiding("draw_s", (Sphere((0.0, -0.5, 0.4)),))
@@ -68,12 +70,12 @@ def test_points_are_denser_where_a_path_bends():
 
 
 def test_faces_are_sent_only_when_the_number_of_paths_changes(scene):
-    shown = Tubes(scene, "/tubes", (10, 20, 30), RADIUS)
-    shown.show(PATHS)
+    shown = Tubes(scene, "/tubes", TubeStyle("rollout", RADIUS))
+    shown.show(PATHS, LIGHT)
     faces = shown.node.faces
-    shown.show(PATHS + 0.1)
+    shown.show(PATHS + 0.1, LIGHT)
     assert shown.node.faces is faces
-    shown.show(PATHS[:0])
+    shown.show(PATHS[:0], LIGHT)
     assert len(shown.node.faces) == 1 and np.ptp(shown.node.vertices) == 0
 
 
@@ -83,53 +85,17 @@ def frame(*rollouts, **changes):
 
 
 def test_lines_are_drawn_only_beside_the_rollouts(scene):
-    task, tubes = TASKS["draw_s"](), Middles()
-    demonstrations, ghost = Demonstrations(scene, tubes), Ghost(scene, tubes)
+    task = TASKS["draw_s"]()
+    demonstrations, ghost = Demonstrations(scene), Ghost(scene)
     first = frame(*task.paths)
-    demonstrations.draw(first)
-    ghost.draw(first)
-    assert len(demonstrations._lines.node.points) == len(ghost._lines.node.points) == 0
+    for picture in (demonstrations, ghost):
+        picture.draw(first, Look(tubes=RolloutTubes(first.rollouts)))
+    assert len(demonstrations.node.points) == len(ghost.node.points) == 0
     aside = tuple(path + np.array([0.0, 0.02, 0.0]) for path in task.paths)
     half = replace(first, rollouts=(*aside[:3], *task.paths[3:]))
-    demonstrations.draw(half)
-    middles = demonstrations._lines.node.points.mean(axis=1)
+    demonstrations.draw(half, Look(tubes=RolloutTubes(half.rollouts)))
+    middles = demonstrations.node.points.mean(axis=1)
     samples = np.concatenate([evenly_bent(path) for path in half.rollouts])
-    assert len(middles) > 100 and KDTree(samples).query(middles)[0].min() > 0.99 * COVERED
-    tubes.shown = False
-    ghost.draw(first)
-    assert len(ghost._lines.node.points) > 10  # nothing covers it any more
-
-
-class TestJumps:
-    @pytest.fixture
-    def clock(self, monkeypatch):
-        times = [100.0]
-        monkeypatch.setattr(rollouts_module.time, "monotonic", lambda: times[0])
-        return times
-
-    @pytest.mark.parametrize(("by", "fades"), [(0.9 * JUMP, False), (1.1 * JUMP, True)])
-    def test_what_jumps_fades_where_it_was(self, scene, clock, by, fades):
-        rollouts, paths = Rollouts(scene, Middles()), (helix(0.5), helix(0.7))
-        former = rollouts.former.node
-        rollouts.draw(frame(*paths))
-        rollouts.fade()
-        assert not former.visible
-        rollouts.draw(frame(paths[0], paths[1] + [by, 0.0, 0.0]))
-        shown = []
-        for clock[0] in (100.0, 100.05, 100.1, 100.2):
-            rollouts.fade()
-            shown.append(former.opacity if former.visible else 0.0)
-        if not fades:
-            assert shown == [0, 0, 0, 0]
-            return
-        np.testing.assert_allclose(shown, [OPACITY, OPACITY * 2 / 3, OPACITY / 3, 0])
-        middles = former.vertices.reshape(-1, NUM_SIDES, 3).mean(axis=1)
-        np.testing.assert_allclose(middles[1:-1], evenly_bent(paths[1])[::SPARSE], atol=1e-6)
-        assert former.vertices.nbytes + former.faces.nbytes < 60e3 / 7  # with all seven of a drag frame's 90 kB: 150 kB
-
-    def test_another_task_fades_nothing(self, scene, clock):
-        rollouts = Rollouts(scene, Middles())
-        rollouts.draw(frame(helix(0.5)))
-        rollouts.draw(replace(frame(helix(0.5) + 1.0), task=TASKS["lift_box"]()))
-        rollouts.fade()
-        assert not rollouts.former.node.visible
+    assert len(middles) > 100 and KDTree(samples).query(middles)[0].min() > 0.99 * INSIDE
+    ghost.draw(first, Look(tubes=RolloutTubes(first.rollouts, shown=False)))
+    assert len(ghost.node.points) > 10  # nothing covers it any more

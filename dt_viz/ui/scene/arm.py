@@ -1,6 +1,12 @@
-"""The JACO arm in the browser: its meshes are sent once, then six rotations for each posture."""
+"""The JACO arm in the browser, its ghost without avoidance, its body points, and arms along the motion.
+
+Meshes are sent once, then six rotations for each posture.
+"""
 
 from __future__ import annotations
+
+import threading
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -9,16 +15,19 @@ from viser import transforms
 
 from dt_viz.avoidance.arm_field import LEVERS
 from dt_viz.flows.fields import Array
+from dt_viz.metrics import interpolate
+from dt_viz.robot.body_points import load_body_points
 from dt_viz.robot.robot import NUM_JOINTS, Robot
-from dt_viz.ui.scene import palette
+from dt_viz.scenario.scenario import View
+from dt_viz.session.engine import ArmMotion
+from dt_viz.session.frame import Frame
 from dt_viz.ui.scene.links import bodies, light_shells
-from dt_viz.ui.scene.picture import Colour, Shown
+from dt_viz.ui.scene.palette import LIGHT, linear
+from dt_viz.ui.scene.picture import Following, Lines, Look, Picture, Shown, add_label
+from dt_viz.ui.scene.style import STYLES
 
 PEDESTAL = 2
 """Number of bodies that no motion moves away: the base, and link 1, which only spins."""
-STALE_OPACITY = 0.4
-"""Opacity of the arm while its motion is not the scenario's."""
-GHOST_OPACITY = 0.5
 SEEN = 4e-4
 """Smallest motion of the hand by a joint that is drawn, metres: a third of a pixel, about."""
 MIN_APART = 0.006
@@ -50,31 +59,20 @@ class ArmFrames:
             self.frames[joint + 1].wxyz = wxyzs[joint]
 
 
-class ArmPicture:
+class ArmPicture(ArmFrames):
     """The arm with its meshes."""
 
     def __init__(self, scene: viser.SceneApi, robot: Robot) -> None:
-        self._tree = ArmFrames(scene, robot, "/arm")
-        self.frames = self._tree.frames
+        super().__init__(scene, robot, "/arm")
         self.meshes: list[viser.MeshHandle] = []
         for frame, body in zip(self.frames, bodies(robot.joint_names), strict=True):
-            for part, mesh, colour in (("shell", body.shell, palette.ARM), ("rings", body.rings, palette.ARM_RING)):
+            for part, mesh, colour in (("shell", body.shell, LIGHT.arm), ("rings", body.rings, LIGHT.arm_ring)):
                 if mesh is not None:
                     self.meshes.append(
                         scene.add_mesh_simple(f"{frame.name}/{part}", mesh.vertices, mesh.faces, color=colour)
                     )
-        self._note = scene.add_label(
-            f"{self.frames[-1].name}/note",
-            "last good motion",
-            anchor="bottom-center",
-            font_screen_scale=0.8,
-            visible=False,
-        )
+        self._note = add_label(scene, f"{self.frames[-1].name}/note", "last good motion", visible=False)
         self.pose(robot.home)
-
-    def pose(self, q: Array) -> None:
-        """Show the joint angles `q` (6,), rad."""
-        self._tree.pose(q)
 
     def show(self, *, whole: bool, pedestal: bool) -> None:
         """Show the whole arm, or only the pedestal under other pictures of it, or nothing."""
@@ -95,15 +93,13 @@ class ArmPicture:
     def stale(self, stale: bool) -> None:
         self._note.visible = stale
         for mesh in self.meshes:
-            mesh.opacity = STALE_OPACITY if stale else None
+            mesh.opacity = STYLES.arm_stale.opacity if stale else None
 
 
 class GhostArm(Shown):
     """A translucent arm, such as that without avoidance; links that coincide with the arm's are hidden."""
 
-    def __init__(
-        self, scene: viser.SceneApi, robot: Robot, name: str = "/ghost_arm", colour: Colour = palette.GHOST
-    ) -> None:
+    def __init__(self, scene: viser.SceneApi, robot: Robot, name: str = "/ghost_arm") -> None:
         """Make the arm, hidden, under a name in the scene tree."""
         self._robot = robot
         self._tree = ArmFrames(scene, robot, name)
@@ -116,8 +112,8 @@ class GhostArm(Shown):
                 f"{frame.name}/shell",
                 shell.vertices,
                 shell.faces,
-                color=colour,
-                opacity=GHOST_OPACITY,
+                color=STYLES.arm_ghost.on(LIGHT),
+                opacity=STYLES.arm_ghost.opacity,
                 cast_shadow=False,
                 receive_shadow=False,
             )
@@ -133,3 +129,118 @@ class GhostArm(Shown):
         moved = np.linalg.norm(corners[1] - corners[0], axis=-1).max(axis=-1)
         for link, distance in zip(self.links, moved, strict=True):
             link.visible = bool(distance > MIN_APART)
+
+
+NUM_ARMS = 6
+"""Number of arms along the motion, start and goal included."""
+
+
+def arms_along(robot: Robot, motion: ArmMotion, num: int = NUM_ARMS) -> Array:
+    """Return joint angles (num, 6), rad, evenly along the path of the hand, its ends included."""
+    steps = np.linalg.norm(np.diff(robot.end_effector(motion.q), axis=0), axis=1)
+    length = np.concatenate([[0.0], np.cumsum(steps + 1e-9)])  # strictly increasing, also where the hand rests
+    return interpolate(np.linspace(0, length[-1], num), length, motion.q)
+
+
+def _add_copies(
+    scene: viser.SceneApi,
+    name: str,
+    mesh: trimesh.Trimesh,
+    num: int,
+    **look: Any,  # noqa: ANN401 - as viser's
+) -> viser.BatchedMeshHandle:
+    """Add so many copies of a mesh that are moved one by one, with viser's further options."""
+    unturned = np.tile((1.0, 0.0, 0.0, 0.0), (num, 1))
+    look |= {"lod": "off", "cast_shadow": False, "receive_shadow": False}
+    return scene.add_batched_meshes_simple(name, mesh.vertices, mesh.faces, unturned, np.zeros((num, 3)), **look)
+
+
+class ArmSequence(Following, Picture):
+    """Several arms along the motion, from faint at its start to strong at its end; a drag sends only their poses."""
+
+    def __init__(self, scene: viser.SceneApi, robot: Robot) -> None:
+        super().__init__(scene.add_frame("/onion", show_axes=False, visible=False))
+        self._robot = robot
+        colour = np.array(linear(LIGHT.onion), np.uint8)
+        opacities = np.linspace(0.12, 0.5, NUM_ARMS, dtype=np.float32)
+        self.links = tuple(
+            _add_copies(
+                scene, f"/onion/link_{index}", shell, NUM_ARMS, batched_colors=colour, batched_opacities=opacities
+            )
+            for index, shell in list(enumerate(light_shells(robot.joint_names)))[PEDESTAL:]
+        )
+
+    def draw(self, frame: Frame, look: Look) -> None:
+        self.follow(frame.arm)
+
+    def _show(self, motion: ArmMotion) -> None:
+        rotations, origins = self._robot.forward_kinematics(arms_along(self._robot, motion))
+        wxyzs = transforms.SO3.from_matrix(rotations).wxyz
+        for joint, link in enumerate(self.links, start=PEDESTAL - 1):
+            # the browser blends nodes from far to near by their own positions
+            link.position = middle = origins[:, joint].mean(axis=0)
+            link.batched_positions = (origins[:, joint] - middle).astype(np.float32)
+            link.batched_wxyzs = wxyzs[:, joint].astype(np.float32)
+
+
+class BodySpheres(Shown):
+    """The spheres that cover the arm, with their displacements by avoidance: the larger, the stronger the colour."""
+
+    def __init__(self, scene: viser.SceneApi, radius: Array) -> None:
+        """Make spheres of these radii (P,), metres."""
+        super().__init__(scene.add_frame("/body_points", show_axes=False, visible=False))
+        self.spheres = _add_copies(
+            scene,
+            "/body_points/spheres",
+            trimesh.creation.icosphere(subdivisions=2),
+            len(radius),
+            batched_scales=radius.astype(np.float32),
+            batched_colors=np.zeros((len(radius), 3), np.uint8),
+            opacity=STYLES.body_points.opacity,
+        )
+        self.paths = Lines(scene, "/body_points/paths", STYLES.body_path)
+
+    def pose(self, positions: Array, without: Array) -> None:
+        """Show the spheres at `positions` (P, 3), with lines from those `without` avoidance (P, 3), metres."""
+        moved = np.linalg.norm(positions - without, axis=1, keepdims=True)
+        still, far = (np.array(linear(colour)) for colour in (LIGHT.body_point, LIGHT.body_point_moved))
+        relative = np.minimum(moved / 0.1, 1)  # moved by a decimetre, they have the full colour
+        self.spheres.position = middle = positions.mean(axis=0)
+        self.spheres.batched_positions = (positions - middle).astype(np.float32)
+        self.spheres.batched_colors = (still + relative * (far - still)).astype(np.uint8)
+        self.paths.show_segments(np.stack([without, positions], axis=1), LIGHT)
+
+
+class Arms:
+    """The arm, its ghost without avoidance, and its body points, which move with the playback."""
+
+    def __init__(self, scene: viser.SceneApi, robot: Robot) -> None:
+        self._robot = robot
+        self._points = load_body_points()
+        self.arm = ArmPicture(scene, robot)
+        self.ghost = GhostArm(scene, robot)
+        self.body = BodySpheres(scene, self._points.radius)
+        self._now = (robot.home, robot.home)
+        self._posing = threading.Lock()  # the playback poses, another thread shows and hides
+
+    def pose(self, q: Array, without: Array) -> None:
+        """Show the joint angles `q` (6,), rad, and those `without` avoidance (6,), rad."""
+        with self._posing:
+            self._now = (q, without)
+            self.arm.pose(q)
+            self._pose_beside()
+
+    def show(self, view: View) -> None:
+        """Show and hide the parts as the view says."""
+        with self._posing:
+            self.arm.show(whole=view.arm, pedestal=view.ghost_arm or view.onion)
+            self.ghost.visible, self.body.visible = view.ghost_arm, view.body_points
+            self._pose_beside()
+
+    def _pose_beside(self) -> None:
+        """Pose the visible parts beside the arm; hidden ones are posed when they are shown."""
+        q, without = self._now
+        if self.ghost.visible:
+            self.ghost.pose(q, without)
+        if self.body.visible:
+            self.body.pose(*self._points.positions(self._robot, np.stack([q, without])))

@@ -1,11 +1,16 @@
-"""Where the camera stands: so that a task's motions and its arm fill the part of the window beside the panel."""
+"""The camera of a visitor: where it stands, and what moves it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import viser
 
 from dt_viz.flows.fields import Array
 from dt_viz.scenario.panels import TITLE_ROOM, directions
@@ -14,106 +19,64 @@ from dt_viz.scenario.tasks import Task
 from dt_viz.ui import gestures
 from dt_viz.ui.ruler import STEP
 
-FIELD_OF_VIEW = 0.75
-"""Vertical field of view, rad."""
-PANEL = 350
-"""Width of the panel and its margins, pixels."""
-NARROW = 577
-"""Width of a window, pixels, below which viser puts the panel under the picture, not beside it: from 36 em down."""
-UNDER = 0.6
-"""Part of a narrow window's height that the panel takes."""
-CAPTION = 0.2
-"""Part of a window's height that the caption of a presentation takes."""
-MARGIN = 0.06
-"""Part of the free window that stays empty on each side."""
-MIN_SIZE, MAX_SIZE = 100, 20_000
-"""Sides of a window that are believed, pixels."""
-USUAL = (1280, 720)
-"""Width and height that are taken for a window whose size is not known, pixels."""
 HOME, HAND = "Home", "Hand"
 """Names of the views from the task's own direction: of all of it, and of the hand, from near."""
 VIEWS = {"Front": (0.0, 1.0, -0.12), "Side": (-1.0, 0.12, -0.12), "Top": (0.0, 0.02, -1.0)}
 """Directions of sight, by name."""
-ARM_SPACE = ((-0.10, -0.10, 0.0), (0.10, 0.10, 0.0), (-0.08, -0.12, 0.80), (0.08, 0.0, 0.80))
-"""Places, metres, between which the arm's base, shoulder and elbow are."""
-HAND_ROOM = (0.0, 0.08, 0.12)
-"""Offset of the wrist from a place of the hand, about, metres."""
-OBSTACLE_ROOM, HAND_AROUND = 0.09, 0.15
-"""Room around the obstacle's first place, and around the hand in the view of it, metres."""
+
+MOVED = 1e-3
+"""Distance of the camera from where it was put, metres, from which on the visitor has moved it."""
+TURN = 2 * np.pi / 90
+"""Angular velocity of the orbit, rad/s."""
+PAUSE = 1.5
+"""Time without a move of the visitor's after which the orbit goes on, seconds."""
 
 Pose = tuple[Array, Array]
 """Position (3,) and look-at (3,) of a camera, metres."""
 
 
-def camera_for(
-    task: Task,
-    camera: Any,  # noqa: ANN401
-    view: str = HOME,
-    panels: Sequence[Slice] = (),
-    hand: Array | None = None,
-    *,
-    alone: bool = False,
-    width: float | None = None,
-    panel: float = PANEL,
-) -> Pose:
-    """Return position (3,) and look-at (3,), metres, for a view of a task.
+@dataclass(frozen=True)
+class Framing:
+    """A window, and which part of it the scene is to fill."""
 
-    Args:
-        task: its motions and its usual direction of sight are taken.
-        camera: viser's, of which the size of the window is taken.
-        view: one of `VIEWS`, `HAND`, or else the task's own: for panels straight onto them.
-        panels: rectangles that are to be seen instead of the task.
-        hand: (3,) where the hand is, metres; without it the view of the hand is that of the task.
-        alone: whether there is a caption instead of the panel.
-        width: smallest width that the window can have, CSS pixels; None if that is not known.
-        panel: width of the panel and its margins, CSS pixels.
-    """
-    position, look_at = (np.asarray(place) for place in task.camera)
-    direction, places = look_at - position, shown(task)
-    if view == HAND and hand is not None:
-        places = hand + around(HAND_AROUND)
-    elif panels:
-        right, up = directions(panels[0], task.camera)
-        direction, above = np.cross(up, right), TITLE_ROOM * up
-        places = np.concatenate([area.border + offset for area in panels for offset in (np.zeros(3), above)])
-    free = free_part(window(camera, width), alone=alone, panel=panel)
-    return framed(places, np.asarray(VIEWS.get(view, direction)), *free)
+    size: tuple[int, int] = (1280, 720)
+    """Width and height of the window, CSS pixels; these where they are not known."""
+    panel: float = 350.0
+    """Width of the panel and its margins, CSS pixels."""
+    alone: bool = False
+    """Whether there is a caption instead of the panel, as in a presentation."""
+    narrow: int = 577
+    """Width of a window, CSS pixels, below which viser puts the panel under the scene, not beside it: 36 em."""
+    under: float = 0.6
+    """Part of a narrow window's height that the panel takes."""
+    caption: float = 0.2
+    """Part of a window's height that the caption takes."""
+    margin: float = 0.06
+    """Part of the free window that stays empty on each side."""
+    field_of_view: float = 0.75
+    """Vertical field of view, rad."""
 
+    @property
+    def free(self) -> tuple[Array, Array]:
+        """What the panel, or the caption, leaves of the window.
 
-def shown(task: Task) -> Array:
-    """Return the places (N, 3) that are to be seen of a task, metres."""
-    paths = np.concatenate(task.paths)
-    obstacle = np.asarray(task.obstacle_position) + around(OBSTACLE_ROOM)
-    pots = [pot.surface()[0] + (pot.x, pot.y, 0.0) for pot in task.pots]
-    objects = [thing.surface()[0] + thing.start for thing in task.objects if thing.start is not None]
-    return np.concatenate([paths, paths + HAND_ROOM, obstacle, ARM_SPACE, *pots, *objects])
+        Returns:
+            The tangents (2,) of the angles between the line of sight and its left and right border, and those of its
+            lower and upper border.
+        """
+        width, height = self.size
+        narrow = width < self.narrow
+        right = 1.0 if narrow or self.alone else 1 - 2 * self.panel / width
+        bottom = 2 * (self.caption if self.alone else self.under if narrow else 0.0) - 1
+        tangent = np.tan(self.field_of_view / 2)
+        across, upright = (
+            np.array([low, high]) + self.margin * (high - low) * np.array([1, -1])
+            for low, high in ((-1.0, right), (bottom, 1.0))
+        )
+        return across * tangent * width / height, upright * tangent
 
 
-def around(distance: float) -> Array:
-    """Return the offsets (6, 3), metres, of the corners of an octahedron."""
-    return distance * np.concatenate([np.eye(3), -np.eye(3)])
-
-
-def free_part(size: tuple[int, int], *, alone: bool = False, panel: float = PANEL) -> tuple[Array, Array]:
-    """Return what the panel, or the caption of a presentation, leaves of a window of this width and height, CSS pixels.
-
-    Returns:
-        The tangents (2,) of the angles between the line of sight and its left and right border, and those of its lower
-        and upper border.
-    """
-    width, height = size
-    narrow = width < NARROW
-    right = 1.0 if narrow or alone else 1 - 2 * panel / width
-    bottom = 2 * (CAPTION if alone else UNDER if narrow else 0.0) - 1
-    tangent = np.tan(FIELD_OF_VIEW / 2)
-
-    def within(low: float, high: float) -> Array:
-        return np.array([low, high]) + MARGIN * (high - low) * np.array([1, -1])
-
-    return within(-1.0, right) * tangent * width / height, within(bottom, 1.0) * tangent
-
-
-def window(camera: Any, width: float | None = None) -> tuple[int, int]:  # noqa: ANN401
+def window_size(camera: Any, width: float | None = None) -> tuple[int, int]:  # noqa: ANN401
     """Return width and height of the window of viser's camera, CSS pixels, as the browser told, if it can be.
 
     The camera's picture has their ratio only: it is as large only while a CSS pixel is a pixel of the picture.
@@ -122,26 +85,57 @@ def window(camera: Any, width: float | None = None) -> tuple[int, int]:  # noqa:
         camera: viser's.
         width: smallest width that the window can have, as of a `Ruler`; None if that is not known.
     """
-    size = gestures.vector((camera.image_width, camera.image_height), 2, MAX_SIZE)
-    if size is None or size.min() < MIN_SIZE:
-        return USUAL
+    size = gestures.vector((camera.image_width, camera.image_height), 2, 20_000)
+    if size is None or size.min() < 100:  # no window has it
+        return Framing.size
     if width is not None and not width <= size[0] < STEP * width:
         size *= width * STEP**0.5 / size[0]
     return round(size[0]), round(size[1])
 
 
-def turned(pose: Pose, size: tuple[int, int], angle: float, *, alone: bool = False, panel: float = PANEL) -> Pose:
-    """Return a camera's position and look-at, metres, turned around the vertical through the middle of its picture.
+def view_of(
+    task: Task, framing: Framing, view: str = HOME, panels: Sequence[Slice] = (), hand: Array | None = None
+) -> Pose:
+    """Return position (3,) and look-at (3,), metres, for a view of a task.
 
     Args:
-        pose: position (3,) and look-at (3,), metres.
-        size: width and height of the window, pixels; the picture is the part of it that the panel leaves.
-        angle: rad.
-        alone: whether there is a caption instead of the panel.
-        panel: width of the panel and its margins, CSS pixels.
+        task: its motions and its usual direction of sight are taken.
+        framing: the part of the window to be filled.
+        view: one of `VIEWS`, `HAND`, or else the task's own: for panels straight onto them.
+        panels: rectangles that are to be seen instead of the task.
+        hand: (3,) where the hand is, metres; without it the view of the hand is that of the task.
     """
+    position, look_at = (np.asarray(place) for place in task.camera)
+    direction, places = look_at - position, places_of(task)
+    if view == HAND and hand is not None:
+        places = hand + _around(0.15)
+    elif panels:
+        right, up = directions(panels[0], task.camera)
+        direction, above = np.cross(up, right), TITLE_ROOM * up
+        places = np.concatenate([area.border + offset for area in panels for offset in (np.zeros(3), above)])
+    return framed(places, np.asarray(VIEWS.get(view, direction)), *framing.free)
+
+
+def places_of(task: Task) -> Array:
+    """Return the places (N, 3) that are to be seen of a task, metres: its motions, its objects, and the arm there."""
+    paths = np.concatenate(task.paths)
+    wrist = paths + np.array([0.0, 0.08, 0.12])
+    base_to_elbow = np.array([(-0.10, -0.10, 0.0), (0.10, 0.10, 0.0), (-0.08, -0.12, 0.80), (0.08, 0.0, 0.80)])
+    obstacle = np.asarray(task.obstacle_position) + _around(0.09)
+    pots = [pot.surface()[0] + (pot.x, pot.y, 0.0) for pot in task.pots]
+    objects = [thing.surface()[0] + thing.start for thing in task.objects if thing.start is not None]
+    return np.concatenate([paths, wrist, obstacle, base_to_elbow, *pots, *objects])
+
+
+def _around(distance: float) -> Array:
+    """Return the offsets (6, 3), metres, of the corners of an octahedron."""
+    return distance * np.concatenate([np.eye(3), -np.eye(3)])
+
+
+def turned(pose: Pose, framing: Framing, angle: float) -> Pose:
+    """Return a pose turned by an angle, rad, around the vertical through the middle of the free part of the window."""
     position, look_at = pose
-    across, upright = free_part(size, alone=alone, panel=panel)
+    across, upright = framing.free
     ahead, right, up = axes(look_at - position)
     depth = np.linalg.norm(look_at - position)
     middle = position + depth * (ahead + across.mean() * right + upright.mean() * up)
@@ -180,3 +174,122 @@ def framed(points: Array, direction: Array, across: Array, upright: Array) -> Po
     x, y = ((least + high * w + most + low * w) / 2 for least, most, low, high in bounds)
     position = x * right + y * up + w * ahead
     return position, position + float((depth.min() + depth.max()) / 2 - w) * ahead
+
+
+class CameraController:
+    """Moves one visitor's camera.
+
+    Where the visitor moves the camera, the orbit waits, and goes on from there; while it is locked, it is put back.
+    """
+
+    def __init__(self, client: viser.ClientHandle, hand: Callable[[], Array | None]) -> None:
+        """Take over the camera of a visitor, and leave it where it is until `look`.
+
+        Args:
+            client: connection of the visitor.
+            hand: says where the hand is, (3,), metres, if it is anywhere.
+        """
+        self.locked = self.orbits = False
+        """Whether the camera is put back where a visitor moves it, and turns slowly around what it shows."""
+        self._client, self._hand = client, hand
+        self._lock = threading.RLock()  # tasks, ticks and reports come from threads of their own
+        self._given: deque[Pose] = deque(maxlen=64)
+        """Poses that the camera was given since it took another view, the newest last: a browser reports late."""
+        self._chosen: Pose | None = None
+        """Pose that the visitor has moved the camera to; None if it stands where it was put."""
+        self._framing = Framing()
+        """The framing of the current view."""
+        self._width: float | None = None
+        self._shown: tuple[Task, Sequence[Slice], str] | None = None
+        """Task, panels and view that the camera was put to show."""
+        self._turned: float | None = None
+        """Time to which the orbit has turned the camera, seconds; None while it does not."""
+        reported: Any = self._reported  # viser takes coroutines, too, against its type hints
+        client.camera.on_update(reported)
+
+    @property
+    def panels(self) -> Sequence[Slice]:
+        """The panels that the camera was put to show."""
+        return () if self._shown is None else self._shown[1]
+
+    @property
+    def framing(self) -> Framing:
+        """The framing in the window as it is now."""
+        return replace(self._framing, size=window_size(self._client.camera, self._width))
+
+    def look(self, task: Task, panels: Sequence[Slice] = ()) -> None:
+        """Move the camera to where the task, or the panels beside its scene, are seen best."""
+        with self._lock:
+            self._shown = task, panels, HOME
+            self._given.clear()
+            self._frame()
+
+    def view(self, name: str = HOME) -> None:
+        """Move the camera to a view of what it shows; see `view_of`. Nothing is done before it shows anything."""
+        with self._lock:
+            if self._shown is not None:
+                self._shown = (*self._shown[:2], name)
+                self._given.clear()
+                self._frame()
+
+    def reframe(self, **changes: Any) -> None:  # noqa: ANN401 - the fields of Framing
+        """Frame the view with other values of `Framing`."""
+        with self._lock:
+            self._framing = replace(self._framing, **changes)
+            self._frame()
+
+    def measured(self, width: float) -> None:
+        """Take the smallest width that the window can have, CSS pixels; that may fit the view."""
+        with self._lock:
+            self._width = width
+            self._fit()
+
+    def turn(self, now: float) -> None:
+        """Turn the camera to where it is at a time, seconds, if it orbits; called again and again."""
+        with self._lock:
+            if not self.orbits or self._shown is None:
+                self._turned = None
+                return
+            seconds = 0.0 if self._turned is None else now - self._turned
+            if self._turned is None or seconds > 0:  # nobody holds the camera
+                self._turned = now
+            if seconds > 0:
+                self._put(turned(self._chosen or self._given[-1], self.framing, TURN * seconds))
+
+    def _frame(self) -> None:
+        if self._shown is not None:
+            task, panels, view = self._shown
+            self._framing = self.framing
+            self._put(view_of(task, self._framing, view, panels, self._hand()))
+            self._client.camera.fov = self._framing.field_of_view
+
+    def _fit(self) -> None:
+        """Frame the view anew if the window has another size, unless the visitor has moved the camera."""
+        if self._chosen is None and self.framing != self._framing:
+            self._frame()
+
+    def _put(self, pose: Pose) -> None:
+        self._given.append(pose)
+        self._chosen = None
+        with self._client.atomic():  # one without the other would be a pose that nobody has given
+            self._client.camera.position, self._client.camera.look_at = pose
+
+    async def _reported(self, camera: viser.CameraHandle) -> None:
+        """Take note of where the camera is: put it back, leave it, or fit the picture to a window of another size."""
+        position, look_at = (
+            gestures.vector(place, 3, gestures.MAX_SIGHT) for place in (camera.position, camera.look_at)
+        )
+        if position is None or look_at is None or self._shown is None:
+            return
+        with self._lock:
+            reported = np.stack([position, look_at])
+            moved = all(np.abs(reported - given).max() > MOVED for given in self._given)
+            if moved and self.locked:
+                self._put(self._chosen or self._given[-1])
+            elif moved:
+                self._chosen = position, look_at
+                if self._turned is not None:
+                    self._turned = time.monotonic() + PAUSE
+            elif self._chosen is not None and np.abs(reported - self._given[-1]).max() <= MOVED:
+                self._chosen = None
+            self._fit()

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dt_viz.flows.fields import Array
-from dt_viz.ui.scene.picture import Colour
+from dt_viz.ui.scene.palette import Colour
 
 NUM_SHADES = 256
 Number = TypeVar("Number", float, Array)

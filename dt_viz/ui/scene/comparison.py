@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from itertools import cycle
 
@@ -15,49 +14,44 @@ from dt_viz.robot.robot import Robot
 from dt_viz.session.comparison import OTHERS
 from dt_viz.session.frame import Compared, Frame, Stage
 from dt_viz.ui.playback import Replay
-from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.arm import GhostArm
-from dt_viz.ui.scene.picture import Colour, Lines, Picture
+from dt_viz.ui.scene.palette import LIGHT, Colour, Theme
+from dt_viz.ui.scene.picture import Lines, Look, Picture, add_label
+from dt_viz.ui.scene.style import STYLES
 
 COLOURS: Mapping[str, Colour] = {
-    method.name: colour for method, colour in zip(OTHERS, cycle(palette.COMPARED), strict=False)
+    method.name: colour for method, colour in zip(OTHERS, cycle(LIGHT.compared), strict=False)
 }
 """Colour of each method's motions, by its name."""
-BOLD, THIN = 0.0055, 0.0014
-"""Thickness of the motion beside the one that the arm follows, and of the others, metres."""
-ABOVE, APART = 0.012, 0.045
-"""Height of a name above its motion, and of one name above another, metres."""
+APART = 0.045
+"""Height of one name above another, metres."""
 
 
 class _DrawnMotions:
     """Motions of one method, and its name beside them."""
 
     def __init__(self, scene: viser.SceneApi, name: str, title: str) -> None:
-        node = f"/compared/{name}"
+        node, number = f"/compared/{name}", list(COLOURS).index(name)
         self.node = scene.add_frame(node, show_axes=False)
-        self.lines = {
-            thickness: Lines(scene, f"{node}/{part}", COLOURS[name], thickness)
-            for part, thickness in (("followed", BOLD), ("others", THIN))
-        }
-        self.label = scene.add_label(f"{node}/name", title, anchor="bottom-center", font_screen_scale=0.8)
+        self.followed = Lines(scene, f"{node}/followed", STYLES.compared_followed, number)
+        self.others = Lines(scene, f"{node}/others", STYLES.compared, number)
+        self.label = add_label(scene, f"{node}/name", title)
 
-    def show(self, compared: Compared, ours: Array, names: list[Array]) -> None:
+    def show(self, compared: Compared, ours: Array, names: list[Array], theme: Theme) -> None:
         """Show motions, with the name where they are farthest from ours.
 
         Args:
             compared: the motions.
             ours: (N, 3) path, metres.
             names: places (3,) of other names, metres, which this one is kept clear of; it is appended.
+            theme: colours.
         """
-        followed, others = [], []
-        for number, path in enumerate(compared.paths):
-            (followed if number == compared.rollout else others).append(path)
-        self.lines[BOLD].show(followed)
-        self.lines[THIN].show(others)
+        followed = compared.paths[compared.rollout : compared.rollout + 1]
+        self.followed.show(followed, theme)
+        self.others.show(compared.paths[: compared.rollout] + compared.paths[compared.rollout + 1 :], theme)
         self.node.visible = bool(followed)
-        if followed:
-            (path,) = followed
-            place = path[np.argmax(distance_from_path(path, ours))] + np.array([0.0, 0.0, ABOVE])
+        for path in followed:
+            place = path[np.argmax(distance_from_path(path, ours))] + np.array([0.0, 0.0, 0.012])
             while any(np.linalg.norm(place - other) < 0.9 * APART for other in names):
                 place = place + np.array([0.0, 0.0, APART])
             names.append(place)
@@ -69,11 +63,11 @@ class ComparedMotions(Picture):
 
     def __init__(self, scene: viser.SceneApi) -> None:
         super().__init__(scene.add_frame("/compared", show_axes=False, visible=False))
-        self._scene, self._dark = scene, False
+        self._scene = scene
         self.motions: dict[str, _DrawnMotions] = {}
         """Of the methods that were ever shown."""
 
-    def draw(self, frame: Frame) -> None:
+    def draw(self, frame: Frame, look: Look) -> None:
         shown = {compared.method.name: compared for compared in frame.comparison if compared.method.name in COLOURS}
         for name in set(self.motions) - set(shown):
             self.motions[name].node.visible = False
@@ -81,17 +75,7 @@ class ComparedMotions(Picture):
         for name, compared in shown.items():
             if name not in self.motions:
                 self.motions[name] = _DrawnMotions(self._scene, name, compared.method.title)
-                self._dye(self.motions[name])
-            self.motions[name].show(compared, frame.rollouts[frame.chosen or 0], names)
-
-    def dye(self, dark: bool) -> None:
-        self._dark = dark
-        for motions in self.motions.values():
-            self._dye(motions)
-
-    def _dye(self, motions: _DrawnMotions) -> None:
-        for lines in motions.lines.values():
-            lines.dye(self._dark)
+            self.motions[name].show(compared, frame.rollouts[frame.chosen or 0], names, look.theme)
 
 
 class TheirArm:
@@ -100,8 +84,6 @@ class TheirArm:
     def __init__(self, scene: viser.SceneApi, robot: Robot) -> None:
         self._ghost = GhostArm(scene, robot, "/their_arm")
         self._replay, self._seen = Replay(), 0.0
-        self._arrived = False
-        """Whether our arm was at the goal when it was looked at last."""
 
     def draw(self, frame: Frame) -> None:
         """Take the motion of a frame; without one, as while its method waits for the obstacle to rest, it is hidden."""
@@ -118,16 +100,14 @@ class TheirArm:
         """Show or hide it; it is hidden until it has a motion."""
         self._ghost.visible = shown and self._replay.motion is not None
 
-    def pose(self, q: Array, speed: float, *, arrived: bool) -> None:
-        """Go on, at a speed relative to real time, beside our arm at `q` (6,), rad, at the goal or not."""
-        now, before = time.monotonic(), self._seen
-        self._seen = now
+    def pose(self, now: float, q: Array, speed: float, *, sets_out: bool) -> None:
+        """Go on to a moment, seconds, at a speed relative to real time, beside our arm at `q` (6,), rad."""
+        before, self._seen = self._seen, now
         if not self._ghost.visible:
             return
-        if self._arrived and not arrived:
+        if sets_out:
             self._replay.restart()
-        self._arrived = arrived
         self._replay.advance(speed * (now - before))
-        posture = self._replay.posture
-        if posture is not None:
-            self._ghost.pose(q, posture[0])
+        theirs = self._replay.q
+        if theirs is not None:
+            self._ghost.pose(q, theirs)

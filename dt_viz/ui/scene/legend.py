@@ -9,14 +9,9 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from dt_viz.pictures.slice_fields import ColourPicture
-from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.colour_scale import NUM_SHADES, Scale
-from dt_viz.ui.scene.picture import Colour
+from dt_viz.ui.scene.palette import LIGHT, Colour, css
 from dt_viz.ui.scene.slice_layers import DET_DECADES, OCCUPANCY_SCALE, scale_of
-
-INK, PAPER = (52, 58, 68), (255, 255, 255, 225)
-HEIGHT = 0.022
-"""Height of a line of text, relative to that of the picture."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +39,7 @@ class Legend:
         )
         mark = ""
         if self.swatch:
-            look = f"display:inline-block;width:1.2em;height:0.7em;background:{palette.css(self.swatch)}"
+            look = f"display:inline-block;width:1.2em;height:0.7em;background:{css(self.swatch)}"
             mark = f"<span style='{look}'></span> "
         return (
             f"<div style='font-size:0.8em;padding:0.2em 1.6em 0.5em;line-height:1.4'>{html.escape(self.title)}"
@@ -54,24 +49,24 @@ class Legend:
 
     def drawn_onto(self, image: Image.Image) -> Image.Image:
         """Draw the legend onto a copy of the RGBA image, in its lower left corner, scaled to its height."""
-        em = round(HEIGHT * image.height)
+        em, ink = round(0.022 * image.height), (52, 58, 68)
         line, left, width = round(1.45 * em), round(1.6 * em), 24 * em
         font = ImageFont.load_default(em)
         plate = Image.new("RGBA", (width + 2 * left, (4 + bool(self.note)) * line))
         draw = ImageDraw.Draw(plate)
-        draw.rounded_rectangle((0, 0, plate.width - 1, plate.height - 1), radius=em // 2, fill=PAPER)
-        draw.text((left, line), self.title, INK, font, anchor="lm")
+        draw.rounded_rectangle((0, 0, plate.width - 1, plate.height - 1), radius=em // 2, fill=(255, 255, 255, 225))
+        draw.text((left, line), self.title, ink, font, anchor="lm")
         shades = Image.fromarray(self.scale.shades[None]).resize((width, round(0.8 * em)), Image.Resampling.BILINEAR)
         plate.paste(shades, (left, round(1.55 * line)))
         for value, text in self.ticks:
-            draw.text((left + self.scale.relative(value) * width, round(2.9 * line)), text, INK, font, anchor="mm")
+            draw.text((left + self.scale.relative(value) * width, round(2.9 * line)), text, ink, font, anchor="mm")
         if self.note:
             start = left
             if self.swatch:
                 low = 3.95 * line
                 draw.rectangle((left, low - 0.35 * em, left + 1.2 * em, low + 0.35 * em), fill=self.swatch)
                 start += round(1.7 * em)
-            draw.text((start, round(3.95 * line)), self.note, INK, font, anchor="lm")
+            draw.text((start, round(3.95 * line)), self.note, ink, font, anchor="lm")
         whole = image.copy()
         whole.alpha_composite(plate, (em, image.height - em - plate.height))
         return whole
@@ -95,7 +90,7 @@ def legend_of(picture: ColourPicture) -> Legend:
             scale,
             tuple((d, f"{10.0**d:g}") for d in decades),
             "0 or less: folded, no diffeomorphism",
-            palette.FOLDED,
+            LIGHT.folded,
         )
     ticks = np.linspace(0, scale.high, 5).tolist()
     return Legend(

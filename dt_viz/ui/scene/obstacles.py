@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from typing import cast
 
 import numpy as np
 import trimesh
@@ -12,20 +12,17 @@ import viser
 from numpy.typing import NDArray
 
 from dt_viz.flows.fields import Array
-from dt_viz.obstacles.shapes import CloudObstacle, MeshObstacle, Obstacle, Sphere
+from dt_viz.obstacles.shapes import CloudObstacle, MeshObstacle, Obstacle, Sphere, as_point, as_quaternion
 from dt_viz.scenario.scenario import MAX_DIAMETER, Scenario
-from dt_viz.scenario.slices import Slice
+from dt_viz.scenario.stack import with_avoidance
 from dt_viz.session.frame import Frame
-from dt_viz.ui import gestures
-from dt_viz.ui.gestures import Drag
-from dt_viz.ui.scene import palette
-from dt_viz.ui.scene.handles import Dragged, Handles
+from dt_viz.session.session import Session
 from dt_viz.ui.scene.links import simplified
+from dt_viz.ui.scene.markers import Marker, MarkerGroup
+from dt_viz.ui.scene.palette import LIGHT
+from dt_viz.ui.scene.picture import Look
+from dt_viz.ui.scene.style import STYLES
 
-HANDLE_SCALE = 0.2
-"""Approximate size of the handles, metres."""
-OPACITY, OPACITY_FAINT, OPACITY_OPENED = 0.8, 0.3, 0.12
-"""Opacities of an obstacle: avoided, not avoided, and while its map is shown."""
 CREASE = 0.6
 """Angle between neighbouring faces above which their edge is drawn sharp, rad."""
 MAX_FACES = 30_000
@@ -33,51 +30,18 @@ MAX_FACES = 30_000
 FINEST = 0.035
 """Size of the cells in which a larger mesh's vertices are merged, in radii of the obstacle."""
 
-Moved = Callable[[int, Array, Array, str], None]
-"""Callback with the index of an obstacle, its new position (3,), metres, quaternion (4,), and the phase of the drag."""
 
+class ObstacleMarker(Marker):
+    """One obstacle."""
 
-class ObstaclePicture:
-    """One obstacle, a child of a gizmo; the browser moves both, without the server."""
-
-    def __init__(
-        self,
-        scene: viser.SceneApi,
-        index: int,
-        moved: Moved,
-        grabbed: Callable[[int], None],
-        clicked: Callable[[int], None],
-        area: Callable[[], Slice | None],
-    ) -> None:
-        """Draw nothing yet.
-
-        Args:
-            scene: scene of the visitor.
-            index: index of the obstacle in the scenario.
-            moved: called with each new pose.
-            grabbed: called with the index when a drag of the obstacle begins.
-            clicked: called with the index when it is clicked.
-            area: returns the slice that it is dragged parallel to.
-        """
-        self.gizmo = scene.add_transform_controls(f"/obstacles/{index}", line_width=3.0, depth_test=False)
-        self.handles = Handles(self.gizmo, HANDLE_SCALE)
-        self.mesh = scene.add_mesh_simple(
-            f"/obstacles/{index}/surface",
-            np.zeros((3, 3), np.float32),
-            np.array([[0, 1, 2]], np.uint32),
-            color=palette.OBSTACLE,
-            opacity=OPACITY,
-        )
-        self._look: Obstacle | None = None
-
-        def dragged(drag: Drag) -> None:
-            if drag.phase == "start":
-                grabbed(index)
-            self.handles.drag(drag, area(), partial(moved, index))
-
-        self.handles.on_move(partial(moved, index))
-        gestures.on_drag(self.mesh, dragged)
-        gestures.on_click(self.mesh, partial(clicked, index))
+    def __init__(self, group: Obstacles, index: int) -> None:
+        """Draw nothing yet; `index` is that of the obstacle in the scenario."""
+        scene, node = group.scene, f"/obstacles/{index}"
+        gizmo = scene.add_transform_controls(node, line_width=3.0, depth_test=False)
+        style, nothing = STYLES.obstacle, (np.zeros((3, 3), np.float32), np.array([[0, 1, 2]], np.uint32))
+        self.mesh = scene.add_mesh_simple(f"{node}/surface", *nothing, color=style.on(LIGHT), opacity=style.opacity)
+        self._shape: Obstacle | None = None
+        super().__init__(group, gizmo, self.mesh, key=index, scale=0.2)
 
     def adopt(self, obstacle: Obstacle, *, handles: bool, avoided: bool, opened: bool) -> None:
         """Show the obstacle where it stands; a pose that the browser has already is not sent to it.
@@ -88,70 +52,52 @@ class ObstaclePicture:
             avoided: whether motions avoid it.
             opened: whether its front faces are left out, to show the inside.
         """
-        self.handles.stand(obstacle.position, obstacle.wxyz)
-        look, scale = unscaled(obstacle.moved((0.0, 0.0, 0.0)))
-        if look != self._look:
-            self._look = look
-            self.mesh.vertices, self.mesh.faces = shaded(look)
-            self.gizmo.disable_rotations = isinstance(look, Sphere)
+        self.stand(obstacle.position, obstacle.wxyz)
+        shape, scale = unscaled(obstacle.moved((0.0, 0.0, 0.0)))
+        if shape != self._shape:
+            self._shape = shape
+            self.mesh.vertices, self.mesh.faces = shaded(shape)
+            self.node.disable_rotations = isinstance(shape, Sphere)
         self.mesh.scale = scale
-        self.handles.scale = HANDLE_SCALE * (0.5 + min(obstacle.radius / MAX_DIAMETER, 0.8))
-        self.handles.show(handles)
+        self.scale = 0.1 + 0.2 * min(obstacle.radius / MAX_DIAMETER, 0.8)
+        self.has_handles = handles
         self.mesh.side = "back" if opened else "front"
-        self.mesh.opacity = OPACITY_OPENED if opened else OPACITY if avoided else OPACITY_FAINT
-
-    def remove(self) -> None:
-        """Take it out of the scene."""
-        self.gizmo.remove()
+        style = STYLES.obstacle_opened if opened else STYLES.obstacle if avoided else STYLES.obstacle_faint
+        self.mesh.opacity = style.opacity
 
 
-class Obstacles(Dragged):
+class Obstacles(MarkerGroup[ObstacleMarker]):
     """All obstacles of a scenario."""
 
-    def __init__(
-        self, scene: viser.SceneApi, moved: Moved, grabbed: Callable[[int], None], clicked: Callable[[int], None]
-    ) -> None:
-        """Begin with none.
+    chosen, handles = "selected", "handles"
 
-        Args:
-            scene: scene of the visitor.
-            moved: called with each new pose of one of them.
-            grabbed: called with the index of one that a drag begins of.
-            clicked: called with the index of one that is clicked.
-        """
-        super().__init__(scene.add_frame("/obstacles", show_axes=False))
+    def __init__(self, scene: viser.SceneApi, session: Callable[[], Session]) -> None:
+        super().__init__(scene, scene.add_frame("/obstacles", show_axes=False), session)
         self._answered = scene.add_frame("/obstacles/answered", show_axes=False, visible=False)
-        self._scene = scene
-        self._moved, self._grabbed, self._clicked = moved, grabbed, clicked
-        self.items: list[ObstaclePicture] = []
-        """Pictures of the obstacles, in the order of the scenario."""
 
-    def draw(self, frame: Frame) -> None:
+    def draw(self, frame: Frame, look: Look) -> None:
         """Tell the page, for those who measure it, where the first obstacle is that the frame is computed for."""
-        super().draw(frame)
+        super().draw(frame, look)
         for obstacle in frame.scenario.obstacles[:1]:
             self._answered.position = obstacle.position
 
-    @property
-    def handles(self) -> Iterable[Handles]:
-        return [item.handles for item in self.items]
-
     def adopt(self, scenario: Scenario) -> None:
-        """Show the scenario's obstacles where they stand."""
-        while len(self.items) > len(scenario.obstacles):
-            self.items.pop().remove()
-        while len(self.items) < len(scenario.obstacles):
-            index = len(self.items)
-            told = self._moved, self._grabbed, self._clicked
-            self.items.append(ObstaclePicture(self._scene, index, *told, self.area))
-        handled = scenario.selected if scenario.view.handles and not scenario.view.move_slice else None
-        for index, (item, obstacle) in enumerate(zip(self.items, scenario.obstacles, strict=True)):
-            item.adopt(
-                obstacle,
-                handles=index == handled,
-                avoided=scenario.avoids,
-                opened=scenario.view.colour == "occupancy",
-            )
+        self._fit(len(scenario.obstacles))
+        handled, opened = self._handled(scenario), scenario.view.colour == "occupancy"
+        for marker, obstacle in zip(self.items, scenario.obstacles, strict=True):
+            marker.adopt(obstacle, handles=marker.key == handled, avoided=scenario.avoids, opened=opened)
+
+    def _new(self, index: int) -> ObstacleMarker:
+        return ObstacleMarker(self, index)
+
+    def _selected(self, scenario: Scenario) -> int | None:
+        return scenario.selected
+
+    def _move(self, session: Session, marker: ObstacleMarker, position: Array, wxyz: Array) -> None:
+        obstacles, index = list(session.scenario.obstacles), cast(int, marker.key)
+        if index < len(obstacles):  # or it was deleted a moment ago
+            obstacles[index] = obstacles[index].moved(as_point(position), as_quaternion(wxyz))
+            session.edit(f"obstacle {index}", stack=with_avoidance(session.scenario, obstacles=tuple(obstacles)))
 
 
 def unscaled(obstacle: Obstacle) -> tuple[Obstacle, float]:

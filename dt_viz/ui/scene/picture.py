@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -14,9 +15,9 @@ from numpy.typing import NDArray
 from dt_viz.flows.fields import Array
 from dt_viz.session.engine import ArmMotion
 from dt_viz.session.frame import Frame
-from dt_viz.ui.scene import palette
-
-Colour = tuple[int, int, int]
+from dt_viz.ui.scene.palette import LIGHT, Theme, linear
+from dt_viz.ui.scene.style import ArrowStyle, BallStyle, LineStyle
+from dt_viz.ui.scene.tubes import RolloutTubes
 
 
 class Shown:
@@ -68,64 +69,77 @@ class Following(Shown, ABC):
         """Draw a motion."""
 
 
+@dataclass(frozen=True)
+class Look:
+    """How a frame is drawn."""
+
+    theme: Theme = LIGHT
+    """Grey where the frame has no motion of the scenario."""
+    blocked: bool = False
+    """Whether there is no motion for the scenario: what the frame holds is another one's."""
+    stale: bool = False
+    """Whether the frame belongs to another task or scene than the scenario that is chosen."""
+    tubes: RolloutTubes = field(default_factory=RolloutTubes)
+    """Tubes of the frame's rollouts."""
+
+
 class Picture(Shown, ABC):
     """A part of the scene that is drawn from frames."""
 
+    _sources: tuple[object, ...] = ()
+    """What it was drawn from last."""
+
     @abstractmethod
-    def draw(self, frame: Frame) -> None:
+    def draw(self, frame: Frame, look: Look) -> None:
         """Show the frame."""
 
-    def dye(self, dark: bool) -> None:
-        """Take the colours of the dark theme, or of the light one, from the next drawing on at the latest."""
+    def _is_new(self, *drawn: object) -> bool:
+        """Whether it was drawn from other objects than these, and note that it is drawn from these now."""
+        before, self._sources = self._sources, drawn
+        return len(before) != len(drawn) or any(a is not b for a, b in zip(before, drawn, strict=True))
 
 
 class Lines:
     """Polylines of one look, as one set of line segments."""
 
-    def __init__(self, scene: viser.SceneApi, name: str, colour: Colour, thickness: float, *, dash: float = 0) -> None:
+    def __init__(self, scene: viser.SceneApi, name: str, style: LineStyle, number: int = 0) -> None:
         """Make an empty set.
 
         Args:
             scene: scene of the visitor.
             name: name in the scene tree.
-            colour: colour of all lines.
-            thickness: metres.
-            dash: length of a dash and of the gap after it, metres; 0 draws through.
+            style: look of all lines.
+            number: which of several colours of the style's name they have.
         """
-        self._dash, self._light = dash, colour
-        self.node = scene.add_line_segments(name, np.zeros((1, 2, 3), np.float32), colour, thickness=thickness)
+        self.style, self._number = style, number
+        self.node = scene.add_line_segments(
+            name, np.zeros((1, 2, 3), np.float32), style.on(LIGHT, number), thickness=style.width
+        )
 
-    @property
-    def colour(self) -> NDArray[np.uint8]:
-        """Colour of all lines, (3,)."""
-        return self.node.colors
-
-    @colour.setter
-    def colour(self, colour: Colour) -> None:
-        self.node.colors = np.array(colour, np.uint8)
-
-    def dye(self, dark: bool) -> None:
-        """Take the colour of the dark theme, or of the light one."""
-        self.colour = palette.shade(self._light, dark)
-
-    def show(self, paths: Sequence[Array]) -> None:
+    def show(self, paths: Sequence[Array], theme: Theme) -> None:
         """Show polylines (T_i, 3), metres."""
-        self.show_segments(self.segments(paths))
+        self.show_segments(self.segments(paths), theme)
 
     def segments(self, paths: Sequence[Array]) -> Array:
         """The segments (K, 2, 3) that polylines (T_i, 3), metres, are drawn with."""
         segments: list[Array] = [np.zeros((0, 2, 3))]
         for path in paths:
             pieces = np.stack([path[:-1], path[1:]], axis=1)
-            if self._dash:
+            if self.style.dash:
                 middle = np.cumsum(np.linalg.norm(pieces[:, 1] - pieces[:, 0], axis=1))
-                pieces = pieces[(middle / self._dash).astype(int) % 2 == 0]
+                pieces = pieces[(middle / self.style.dash).astype(int) % 2 == 0]
             segments.append(pieces)
         return np.concatenate(segments)
 
-    def show_segments(self, segments: Array) -> None:
+    def show_segments(self, segments: Array, theme: Theme) -> None:
         """Show segments (K, 2, 3), metres."""
         self.node.points = segments.astype(np.float32)
+        self.node.thickness = self.style.width
+        self.paint(theme)
+
+    def paint(self, theme: Theme) -> None:
+        """Take the colour that a theme has for them."""
+        self.node.colors = np.array(self.style.on(theme, self._number), np.uint8)
 
 
 def assign(node: Any, points: Array, colours: NDArray[np.uint8]) -> None:  # noqa: ANN401 - lines, arrows and clouds
@@ -137,46 +151,45 @@ def assign(node: Any, points: Array, colours: NDArray[np.uint8]) -> None:  # noq
     node.colors = colours if len(colours) else np.zeros(3, np.uint8)
 
 
-def rgb(colour: Colour, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    """Return one colour, as linear light, for an array of points of this shape."""
-    return np.broadcast_to(np.array(palette.linear(colour), dtype=np.uint8), shape)
-
-
 class Arrows:
-    """Vectors at points, the larger the longer and darker."""
+    """Vectors at points, the larger the longer and nearer to the strong colour."""
 
-    def __init__(
-        self, scene: viser.SceneApi, name: str, little: Colour, much: Colour, length: float, thickness: float = 1.0
-    ) -> None:
-        """Make an empty set.
-
-        Args:
-            scene: scene of the visitor.
-            name: name in the scene tree.
-            little: colour of the shortest.
-            much: colour of the longest.
-            length: length of the longest, metres.
-            thickness: thickness relative to the vector field's.
-        """
-        self._little, self._much, self._length = np.array(little), np.array(much), length
+    def __init__(self, scene: viser.SceneApi, name: str, style: ArrowStyle) -> None:
+        """Make an empty set of this name in the scene tree."""
+        self._style = style
         self.node = scene.add_arrows(
             name,
             np.zeros((1, 2, 3), np.float32),
-            rgb(little, (1, 3)),
-            shaft_radius=0.0011 * thickness,
-            head_radius=0.0034 * thickness,
-            head_length=0.0085 * thickness,
+            np.array([style.on(LIGHT)], np.uint8),
+            shaft_radius=0.0011 * style.thickness,
+            head_radius=0.0034 * style.thickness,
+            head_length=0.0085 * style.thickness,
         )
 
-    def paint(self, little: Colour, much: Colour) -> None:
-        """Give other colours to the shortest and the longest, from the next time that they are shown."""
-        self._little, self._much = np.array(little), np.array(much)
-
-    def show(self, points: Array, vectors: Array) -> None:
+    def show(self, points: Array, vectors: Array, theme: Theme) -> None:
         """Show vectors (N, 3), of any unit, with their middles at points (N, 3), metres."""
         size = np.linalg.norm(vectors, axis=1, keepdims=True)
         # the largest lie where ψ⁻¹ stretches most; a high quantile as the unit keeps the others readable
         relative = np.minimum(size / np.quantile(size, 0.9), 1) if len(size) else size
-        arrows = vectors / np.maximum(size, 1e-12) * self._length * (0.45 + 0.55 * relative)
+        arrows = vectors / np.maximum(size, 1e-12) * self._style.length * (0.45 + 0.55 * relative)
         ends = np.stack([points - arrows / 2, points + arrows / 2], axis=1)
-        assign(self.node, ends, (self._little + relative * (self._much - self._little)).astype(np.uint8))
+        weak, strong = (np.array(linear(c)) for c in (getattr(theme, self._style.weak), self._style.on(theme)))
+        assign(self.node, ends, (weak + relative * (strong - weak)).astype(np.uint8))
+
+
+def add_label(
+    scene: viser.SceneApi,
+    name: str,
+    text: str = "",
+    *,
+    height: float = 0.0,
+    **options: Any,  # noqa: ANN401 - as viser's
+) -> viser.LabelHandle:
+    """Add a text whose foot is a height, metres, above the origin of its parent, with viser's further options."""
+    usual = {"position": (0.0, 0.0, height), "anchor": "bottom-center", "font_screen_scale": 0.8}
+    return scene.add_label(name, text, **(usual | options))
+
+
+def add_ball(scene: viser.SceneApi, name: str, style: BallStyle, **options: Any) -> viser.IcosphereHandle:  # noqa: ANN401
+    """Add the ball that marks a place, with viser's further options."""
+    return scene.add_icosphere(name, radius=style.radius, color=style.on(LIGHT), **options)

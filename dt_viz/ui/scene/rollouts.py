@@ -1,179 +1,109 @@
-"""The rollouts as tubes, and the lines beside them: demonstrations and the undisturbed motion."""
+"""Motions in the scene: rollouts as tubes, those of a level of the stack, and the lines beside them."""
 
 from __future__ import annotations
 
-import math
-import time
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import viser
-from scipy.spatial import KDTree
 
 from dt_viz.flows.fields import Array
+from dt_viz.motion.diagnostics import MAX_GOAL_MISS
+from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.stack import IMITATION
 from dt_viz.session.frame import Frame, Stage
-from dt_viz.ui.scene import palette
-from dt_viz.ui.scene.picture import Lines, Picture
+from dt_viz.ui.scene.picture import Lines, Look, Picture, add_ball, add_label
+from dt_viz.ui.scene.style import STYLES
 from dt_viz.ui.scene.tubes import Tubes, middles_of
 
-BOLD, THIN = 0.0034, 0.0020
-"""Radius of the rollout that the arm follows, and of the others, metres."""
-BESIDE = 0.7
-"""Thickness of rollouts beside those of a level, relative to the usual one."""
-OPACITY = 0.55
-"""Opacity of the rollouts that the arm does not follow."""
-COVERED = 0.0035
-"""Distance of a line from the middle of a rollout up to which it counts as inside its tube, metres."""
-BETWEEN = 5
-"""Number of points from one ring of a tube to the next that lines are compared with."""
-JUMP, FADING = 0.05, 0.15
-"""Distance by which a rollout jumps, metres, where it then fades out where it was, and the time that takes, seconds."""
-SPARSE = 3
-"""Stride of the rings with which it is drawn there: the faces are sent, too, which other frames of a drag keep."""
 
+class _OutsideTubes(Picture):
+    """Lines where they are not inside the tube of a rollout; while a drag goes on they follow with the field."""
 
-@dataclass(frozen=True, eq=False)
-class _Tubes:
-    """Where the tubes of rollouts lie."""
-
-    rollouts: tuple[Array, ...]
-    """(T_i, 3), metres."""
-    middles: Array
-    """(R, K, 3), metres."""
-
-    @cached_property
-    def samples(self) -> KDTree:
-        """Points along the middles."""
-        part = np.arange(BETWEEN)[:, None] / BETWEEN
-        pieces = self.middles[:, :-1, None] + part * np.diff(self.middles, axis=1)[:, :, None]
-        return KDTree(np.concatenate([pieces.reshape(-1, 3), self.middles[:, -1]]))
-
-
-class Middles:
-    """The middles of the tubes that a frame's rollouts are drawn with, worked out once, and what the tubes cover."""
-
-    def __init__(self) -> None:
-        self.shown = True
-        """Whether the tubes are shown; hidden ones cover nothing."""
-        self._newest = _Tubes((), middles_of(()))
-
-    def of(self, rollouts: tuple[Array, ...]) -> Array:
-        """The middles (R, K, 3) of tubes around rollouts (T_i, 3), metres."""
-        if rollouts is not self._newest.rollouts:
-            self._newest = _Tubes(rollouts, middles_of(rollouts))
-        return self._newest.middles
-
-    def beside(self, segments: Array, distance: float = COVERED) -> Array:
-        """Those of the segments (K, 2, 3) farther than a distance from the middles asked for last, all in metres."""
-        newest = self._newest
-        if not self.shown or not newest.rollouts:
-            return segments
-        away, _ = newest.samples.query(segments.mean(axis=1), distance_upper_bound=distance)
-        return segments[np.isinf(away)]
-
-
-class _Beside(Picture, ABC):
-    """Lines where no rollout covers them; while a drag goes on they follow with the field."""
-
-    def __init__(self, lines: Lines, middles: Middles) -> None:
+    def __init__(self, lines: Lines) -> None:
         super().__init__(lines.node)
-        self._lines, self._middles = lines, middles
-        self._drawn: tuple[object, bool] | None = None
-        """Task drawn last, and whether its rollouts covered something."""
+        self._lines = lines
 
-    def draw(self, frame: Frame) -> None:
-        drawn = frame.task, self._middles.shown
-        if frame.stage is Stage.ROLLOUTS and drawn == self._drawn:
-            return
-        self._drawn = drawn
-        self._middles.of(frame.rollouts)
-        self._lines.show_segments(self._middles.beside(self._lines.segments(self._paths(frame))))
+    def draw(self, frame: Frame, look: Look) -> None:
+        if (
+            self._is_new(frame.task, look.tubes.shown, self._lines.style.on(look.theme))
+            or frame.stage is not Stage.ROLLOUTS
+        ):
+            segments = self._lines.segments(self._paths(frame))
+            self._lines.show_segments(look.tubes.outside(segments), look.theme)
 
     @abstractmethod
     def _paths(self, frame: Frame) -> Sequence[Array]:
         """Return the paths (T_i, 3), metres."""
 
 
-class Demonstrations(_Beside):
+class Demonstrations(_OutsideTubes):
     """The demonstrations, as thin lines."""
 
-    def __init__(self, scene: viser.SceneApi, middles: Middles) -> None:
-        super().__init__(Lines(scene, "/demonstrations", palette.DEMONSTRATION, 0.0018), middles)
+    def __init__(self, scene: viser.SceneApi) -> None:
+        super().__init__(Lines(scene, "/demonstrations", STYLES.demonstration))
 
     def _paths(self, frame: Frame) -> Sequence[Array]:
         return frame.task.paths
 
 
-class Ghost(_Beside):
+class Ghost(_OutsideTubes):
     """The undisturbed motion of the rollout that the arm follows, dashed."""
 
-    def __init__(self, scene: viser.SceneApi, middles: Middles) -> None:
-        super().__init__(Lines(scene, "/ghost", palette.GHOST, 0.003, dash=0.012), middles)
+    def __init__(self, scene: viser.SceneApi) -> None:
+        super().__init__(Lines(scene, "/ghost", STYLES.ghost))
 
     def _paths(self, frame: Frame) -> Sequence[Array]:
         own = frame.ghost[: len(frame.ghost) - frame.num_added]
         return own if frame.chosen is None else frame.ghost[frame.chosen : frame.chosen + 1]
 
-    def dye(self, dark: bool) -> None:
-        self._lines.dye(dark)
-
 
 class Rollouts(Picture):
-    """The rollouts as tubes: the one that the arm follows thick, the others thin and translucent.
+    """The rollouts as tubes: the one that the arm follows thick, the others thin and translucent."""
 
-    Where some of them jump elsewhere, as when a drag takes them past the other side of an obstacle, they fade out
-    where they were.
-    """
-
-    def __init__(self, scene: viser.SceneApi, middles: Middles) -> None:
+    def __init__(self, scene: viser.SceneApi) -> None:
         super().__init__(scene.add_frame("/rollouts", show_axes=False))
-        self._middles = middles
-        self.hero = Tubes(scene, "/rollouts/followed", palette.ROLLOUT, BOLD, ball=2.4 * BOLD)
-        self.others = Tubes(scene, "/rollouts/others", palette.ROLLOUT, THIN, ball=2.6 * THIN, opacity=OPACITY)
-        self.added = Tubes(scene, "/rollouts/added", palette.ADDED, THIN)
-        self.former = Tubes(scene, "/rollouts/former", palette.ROLLOUT, THIN, opacity=OPACITY)
-        self._added = palette.ADDED
-        self._drawn: tuple[object, Array] | None = None
-        """Task and middles drawn last."""
-        self._jumped = -math.inf
-        """Time at which some jumped, seconds."""
+        self.followed = Tubes(scene, "/rollouts/followed", STYLES.followed)
+        self.others = Tubes(scene, "/rollouts/others", STYLES.rollout)
+        self.added = Tubes(scene, "/rollouts/added", STYLES.added)
 
-    def draw(self, frame: Frame) -> None:
-        middles = self._middles.of(frame.rollouts)
+    def draw(self, frame: Frame, look: Look) -> None:
+        middles, theme = look.tubes.middles, look.theme
         number = np.arange(len(middles))
         followed = number == (frame.chosen if frame.level is None else None)
         added = number >= len(middles) - frame.num_added
-        scale = 1.0 if frame.level is None else BESIDE
-        self.hero.show(middles[followed])
-        self.others.show(middles[~added & ~followed], scale=scale)
-        self.added.show(middles[added & ~followed])
-        for tubes, colour in (
-            (self.hero, palette.ROLLOUT),
-            (self.others, palette.ROLLOUT),
-            (self.added, self._added),
-        ):
-            tubes.colour = palette.STALE if frame.blocked else colour
-        self._fade_what_jumped(frame.task, middles)
+        self.followed.show(middles[followed], theme)
+        # thinner beside those of a level
+        self.others.show(middles[~added & ~followed], theme, scale=1.0 if frame.level is None else 0.7)
+        self.added.show(middles[added & ~followed], theme)
 
-    def dye(self, dark: bool) -> None:
-        self._added = palette.shade(palette.ADDED, dark)
 
-    def _fade_what_jumped(self, task: object, middles: Array) -> None:
-        """Begin to let those fade that were drawn far from where they are now, of the same task."""
-        before, self._drawn = self._drawn, (task, middles)
-        if before is None or before[0] is not task or before[1].shape != middles.shape:
-            return
-        jumped = np.linalg.norm(before[1] - middles, axis=2).max(axis=1, initial=0) > JUMP
-        if jumped.any():
-            self.former.show(before[1][jumped, ::SPARSE])
-            self._jumped = time.monotonic()
+class LevelRollouts(Picture):
+    """Rollouts of the selected level, without the transforms stacked on it, and the name of its manifold."""
 
-    def fade(self) -> None:
-        """Let what has jumped fade; called again and again."""
-        left = 1 - (time.monotonic() - self._jumped) / FADING
-        self.former.node.visible = left > 0
-        if left > 0:
-            self.former.node.opacity = OPACITY * left
+    def __init__(self, scene: viser.SceneApi) -> None:
+        super().__init__(scene.add_frame("/level", show_axes=False, visible=False))
+        self.tubes = Tubes(scene, "/level/rollouts", STYLES.level)
+        self.end = scene.add_frame("/level/end", show_axes=False, visible=False)
+        add_ball(scene, "/level/end/ball", STYLES.level_end)
+        add_label(scene, "/level/end/label", "its end", height=0.02)
+        self.label = add_label(scene, "/level/label", font_screen_scale=1.1)
+
+    def draw(self, frame: Frame, look: Look) -> None:
+        if frame.level is not None:
+            paths = frame.levels[frame.level]
+            self.tubes.show(middles_of(paths), look.theme)
+            self.end.position = paths[0][-1]  # marked unless it is the goal
+            self.end.visible = bool(np.linalg.norm(paths[0][-1] - frame.goal) > MAX_GOAL_MISS)
+            self.label.text, area = manifold(frame.scenario), frame.slice
+            self.label.position = area.centre + np.array([0.0, 0.0, np.ptp(area.border[:, 2]) / 2 + 0.03])
+        self.visible = frame.level is not None
+
+
+def manifold(scenario: Scenario) -> str:
+    """Return the name of the manifold of the level that the view shows."""
+    level = scenario.view.level
+    if level == IMITATION:
+        return "manifold of the imitation" if scenario.imitation else "base attractor: straight motions"
+    return f"manifold up to {level[:1].lower() + level[1:]}"

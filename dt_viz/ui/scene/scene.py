@@ -1,34 +1,35 @@
-"""Frame → scene handles. Each picture is a class with `draw(frame)` and `visible`."""
+"""Frame → scene handles. Each picture is a class with `draw(frame, look)` and `visible`."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from typing import NamedTuple, cast
 
 import numpy as np
 import viser
 
 from dt_viz.motion.diagnostics import MAX_GOAL_MISS
 from dt_viz.robot.robot import Robot
-from dt_viz.scenario.scenario import Scenario, View
+from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import anchored
 from dt_viz.session.frame import Frame
-from dt_viz.ui.scene import palette
-from dt_viz.ui.scene.anchors import BALL_RADIUS, Anchors
-from dt_viz.ui.scene.arm_layers import Onion
+from dt_viz.session.session import Session
+from dt_viz.ui.scene.arm import ArmSequence
+from dt_viz.ui.scene.bias_points import BiasPoints
 from dt_viz.ui.scene.comparison import ComparedMotions
-from dt_viz.ui.scene.levels import LevelRollouts
-from dt_viz.ui.scene.manifold import Generator, WarpedGrid
 from dt_viz.ui.scene.obstacles import Obstacles
+from dt_viz.ui.scene.palette import LIGHT, Theme
 from dt_viz.ui.scene.panels import Panels
-from dt_viz.ui.scene.picture import Picture
-from dt_viz.ui.scene.rollouts import Demonstrations, Ghost, Middles, Rollouts
+from dt_viz.ui.scene.picture import Look, Picture, add_ball, add_label
+from dt_viz.ui.scene.rollouts import Demonstrations, Ghost, LevelRollouts, Rollouts
 from dt_viz.ui.scene.slice import MovableSlice
-from dt_viz.ui.scene.slice_layers import ColourSlice, FieldArrows, OccupancySlice, Streamlines
-from dt_viz.ui.scene.stage import Table, background, set_stage
+from dt_viz.ui.scene.slice_layers import ColourSlice, FieldArrows, Generator, OccupancySlice, Streamlines, WarpedGrid
+from dt_viz.ui.scene.stage import Stage
 from dt_viz.ui.scene.starts import Starts
+from dt_viz.ui.scene.style import STYLES
+from dt_viz.ui.scene.tubes import RolloutTubes
 
 GOAL, OLD_GOAL = "goal", "demonstrated goal"
 """Labels of the demonstrations' end: where motions end there, and where they end elsewhere."""
@@ -36,86 +37,74 @@ OF_A_MOTION = {"field", "streamlines", "grid", "onion"}
 """Fields of `View` whose pictures are hidden while there is no motion: unlike the rollouts they cannot turn grey."""
 OF_A_TASK = {"demonstrations", "ghost", "panels", "compared"}
 """Fields of `View` whose pictures are hidden while another task or scene is being computed."""
-COMPUTING = "computing"
 
 
 class Goal(Picture):
     """The goal as a ball, and a second ball where motions end if something covers the goal."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
-        self._goal = scene.add_frame("/goal", show_axes=False)
-        super().__init__(self._goal)
-        label = {"position": (0.0, 0.0, 0.02), "anchor": "bottom-center", "font_screen_scale": 0.8}
-        scene.add_icosphere("/goal/ball", radius=0.012, color=palette.GOAL)
-        self.label = scene.add_label("/goal/label", GOAL, **label)
+        super().__init__(scene.add_frame("/goal", show_axes=False))
+        add_ball(scene, "/goal/ball", STYLES.goal)
+        self.label = add_label(scene, "/goal/label", GOAL, height=0.02)
         self._end = scene.add_frame("/end", show_axes=False, visible=False)
-        scene.add_icosphere("/end/ball", radius=0.009, color=palette.ROLLOUT)
-        scene.add_label("/end/label", "end", **label)
+        add_ball(scene, "/end/ball", STYLES.end)
+        add_label(scene, "/end/label", "end", height=0.02)
 
-    def draw(self, frame: Frame) -> None:
-        self._goal.position = frame.goal
+    def draw(self, frame: Frame, look: Look) -> None:
+        self.node.position = frame.goal
         self._end.position = frame.reached
         elsewhere = bool(np.linalg.norm(frame.reached - frame.goal) > MAX_GOAL_MISS)
         self.label.text = OLD_GOAL if elsewhere else GOAL
         # the marker of a transform that moves the goal says so
         goals = [to.anchor for to in anchored(frame.scenario).values() if to.anchor is not None and to.ends_motions]
-        marked = any(np.linalg.norm(frame.reached - goal) < BALL_RADIUS for goal in goals)
+        marked = any(np.linalg.norm(frame.reached - goal) < STYLES.bias.radius for goal in goals)
         self._end.visible = elsewhere and not marked
+
+
+class Markers(NamedTuple):
+    """All that a visitor drags, but for the hand."""
+
+    obstacles: Obstacles
+    bias_points: BiasPoints
+    slice: MovableSlice
+    starts: Starts
 
 
 class ScenePictures:
     """Everything in the scene of one visitor that is drawn from frames."""
 
-    def __init__(
-        self,
-        scene: viser.SceneApi,
-        robot: Robot,
-        obstacles: Obstacles,
-        anchors: Anchors,
-        area: MovableSlice,
-        starts: Starts,
-    ) -> None:
-        """Build the rest of the scene of this robot, beside what its visitor drags."""
-        set_stage(scene)
-        self._scene = scene
-        self.obstacles, self.anchors, self.slice, self.starts = obstacles, anchors, area, starts
-        self._always: tuple[Picture, ...] = (
-            self.obstacles,
-            self.anchors,
-            self.slice,
-            self.starts,
-            LevelRollouts(scene),
-            Goal(scene),
+    def __init__(self, scene: viser.SceneApi, robot: Robot, session: Callable[[], Session]) -> None:
+        """Build the scene of this robot; `session` returns the one that its markers edit."""
+        self.markers = Markers(
+            Obstacles(scene, session), BiasPoints(scene, session), MovableSlice(scene, session), Starts(scene, session)
         )
-        self.middles = Middles()
-        """Of the rollouts that are drawn."""
-        self.rollouts = Rollouts(scene, self.middles)
+        self._always: tuple[Picture, ...] = (*self.markers, LevelRollouts(scene), Goal(scene))
         self._by_view: dict[str, Picture] = {
-            "demonstrations": Demonstrations(scene, self.middles),
-            "rollouts": self.rollouts,
-            "ghost": Ghost(scene, self.middles),
+            "demonstrations": Demonstrations(scene),
+            "rollouts": Rollouts(scene),
+            "ghost": Ghost(scene),
             "field": FieldArrows(scene),
             "streamlines": Streamlines(scene),
-            "table": Table(scene),
+            "table": Stage(scene),
             "generator": Generator(scene),
             "grid": WarpedGrid(scene),
             "panels": Panels(scene),
-            "onion": Onion(scene, robot),
+            "onion": ArmSequence(scene, robot),
             "compared": ComparedMotions(scene),
         }
-        self._view, self._blocked = View(), False
-        self._showing = threading.Lock()  # views change on another thread than the one that draws
-        self._drawing = threading.Lock()
-        self._frame: Frame | None = None
-        self._adopted: Scenario | None = None
-        self._grey = False
-        """Whether the last frame was drawn as `stale`."""
         function = ColourSlice(scene)
         self._by_colour: dict[str, Picture] = {
             "det": function,
             "lyapunov": function,
             "occupancy": OccupancySlice(scene),
         }
+        self._showing = threading.Lock()  # views change on another thread than the one that draws
+        self._drawing = threading.Lock()
+        self._frame: Frame | None = None
+        self._adopted: Scenario | None = None
+        self._theme = LIGHT
+        self.look = Look()
+        """What the last frame was drawn with."""
 
     def layer(self, view: str) -> Picture:
         """The picture that this field of `View` shows or hides."""
@@ -130,58 +119,67 @@ class ScenePictures:
         """Assign fresh arrays to the handles."""
         with self._drawing:
             self._frame = frame
-            self._draw(frame)
-
-    def _draw(self, frame: Frame) -> None:
-        """Draw a frame, a stale one grey: as one that there is no motion for."""
-        before, self._grey = (self._blocked, self._grey), self.stale
-        self.middles.shown = self._view.rollouts
-        if self._grey:
-            frame = replace(frame, blocked=(*frame.blocked, COMPUTING))
-        for picture in self._pictures:
-            picture.draw(frame)
-        if (bool(frame.blocked), self._grey) != before:
-            with self._showing:
-                self._blocked = bool(frame.blocked)
-                self._show()
-
-    def dye(self, dark: bool) -> None:
-        """Take the colours of the dark theme, or of the light one."""
-        self._scene.set_background_image(background(dark), "png")
-        with self._drawing:
-            for picture in self._pictures:
-                picture.dye(dark)
-            if self._frame is not None:
-                self._draw(self._frame)
-
-    @property
-    def _pictures(self) -> tuple[Picture, ...]:
-        return *self._always, *self._by_view.values(), *dict.fromkeys(self._by_colour.values())
+            self._draw()
 
     def adopt(self, scenario: Scenario) -> None:
-        """Show and hide what the scenario's view says, and move the obstacles to where they stand."""
+        """Show and hide what the scenario's view says, and move the markers to where their things stand."""
         self._adopted = scenario
-        self.obstacles.adopt(scenario)
-        self.anchors.adopt(scenario)
-        self.slice.adopt(scenario)
-        self.starts.adopt(scenario)
-        with self._showing:
-            self._view = scenario.view
-            self._show()
+        for markers in self.markers:
+            markers.adopt(scenario)
+        self._show()
         # a thread that is drawing has seen the new scenario, or is waited for
-        if (self.stale, scenario.view.rollouts) != (self._grey, self.middles.shown):
-            with self._drawing:
-                if self._frame is not None:
-                    self._draw(self._frame)
+        if self._wanted_look() != self.look:
+            self._redraw()
+
+    @property
+    def theme(self) -> Theme:
+        """Colours of everything; others draw the last frame again."""
+        return self._theme
+
+    @theme.setter
+    def theme(self, theme: Theme) -> None:
+        if theme is self._theme:
+            return
+        self._theme = theme
+        cast(Stage, self._by_view["table"]).paint(theme)
+        self._redraw()
+
+    def _redraw(self) -> None:
+        with self._drawing:
+            if self._frame is not None:
+                self._draw()
+
+    def _wanted_look(self) -> Look:
+        """How the frame is to be drawn: a stale one as one that there is no motion for."""
+        frame, tubes, stale = self._frame, self.look.tubes, self.stale
+        if frame is None:
+            return self.look
+        blocked = stale or bool(frame.blocked)
+        shown = self._adopted is None or self._adopted.view.rollouts
+        if tubes.rollouts is not frame.rollouts or tubes.shown != shown:
+            tubes = RolloutTubes(frame.rollouts, shown)
+        return Look(self._theme.without_motion if blocked else self._theme, blocked, stale, tubes)
+
+    def _draw(self) -> None:
+        assert self._frame is not None
+        before, self.look = self.look, self._wanted_look()
+        for picture in (*self._always, *self._by_view.values(), *dict.fromkeys(self._by_colour.values())):
+            picture.draw(self._frame, self.look)
+        if (before.blocked, before.stale) != (self.look.blocked, self.look.stale):
+            self._show()
 
     def _show(self) -> None:
         """Show what the view says; nothing that belongs to another motion while the scenario has none."""
-        for name, picture in self._by_view.items():
-            hidden = (self._blocked and name in OF_A_MOTION) or (self._grey and name in OF_A_TASK)
-            picture.visible = bool(getattr(self._view, name)) and not hidden
-        shown = None if self._blocked else self._by_colour.get(self._view.colour)
-        for picture in self._by_colour.values():
-            picture.visible = picture is shown
+        with self._showing:
+            if self._adopted is None:
+                return
+            view, look = self._adopted.view, self.look
+            hidden = (OF_A_MOTION if look.blocked else set()) | (OF_A_TASK if look.stale else set())
+            for name, picture in self._by_view.items():
+                picture.visible = bool(getattr(view, name)) and name not in hidden
+            shown = None if look.blocked else self._by_colour.get(view.colour)
+            for picture in self._by_colour.values():
+                picture.visible = picture is shown
 
     @contextmanager
     def without_handles(self) -> Iterator[None]:
@@ -189,7 +187,9 @@ class ScenePictures:
         table = self._by_view["table"]
         shown, table.visible = table.visible, False
         try:
-            with self.obstacles.without_handles(), self.anchors.without_handles(), self.slice.without_handles():
+            with ExitStack() as stack:
+                for markers in self.markers:
+                    stack.enter_context(markers.without_handles())
                 yield
         finally:
             table.visible = shown

@@ -2,42 +2,41 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import viser
 
+from dt_viz.flows.fields import Array
+from dt_viz.obstacles.shapes import as_point, as_quaternion
 from dt_viz.scenario.scenario import Scenario
-from dt_viz.scenario.slices import Slice
+from dt_viz.scenario.slices import Slice, SlicePose
 from dt_viz.session.frame import Frame
-from dt_viz.ui.scene import palette
-from dt_viz.ui.scene.handles import Handles, Moved
-from dt_viz.ui.scene.picture import Lines, Picture
-
-HANDLE_SCALE = 0.24
-"""Approximate size of the handles, metres."""
+from dt_viz.session.session import Session
+from dt_viz.ui.scene.markers import Marker, MarkerGroup
+from dt_viz.ui.scene.picture import Lines, Look
+from dt_viz.ui.scene.style import STYLES
 
 
-class MovableSlice(Picture):
+class MovableSlice(MarkerGroup[Marker]):
     """The frame of the slice as a child of a gizmo; the browser moves both, without the server."""
 
-    def __init__(self, scene: viser.SceneApi, moved: Moved) -> None:
-        """Begin hidden; `moved` is called with each new pose, the position being the slice's centre."""
-        self.gizmo = scene.add_transform_controls("/slice", line_width=3.0, depth_test=False, visible=False)
-        super().__init__(self.gizmo)
-        self.border = Lines(scene, "/slice/border", palette.SLICE, 0.0022)
+    def __init__(self, scene: viser.SceneApi, session: Callable[[], Session]) -> None:
+        gizmo = scene.add_transform_controls("/slice", line_width=3.0, depth_test=False, visible=False)
+        super().__init__(scene, gizmo, session)
+        self.border = Lines(scene, "/slice/border", STYLES.slice_border)
         self._home: Slice | None = None
-        self._handles = Handles(self.gizmo, HANDLE_SCALE)
-        self._handles.on_move(moved)
+        """Slice of the task."""
         self._scenario: Scenario | None = None
+        self._fit(1)
 
-    def draw(self, frame: Frame) -> None:
+    def draw(self, frame: Frame, look: Look) -> None:
         """Remembers the slice of the task."""
-        home = frame.task.slice
-        if home is not self._home:
-            self._home = home
+        if self._is_new(frame.task.slice):
+            self._home = home = frame.task.slice
             flat = Slice(np.zeros(3), np.eye(3)[:, :2], home.half_size)
-            self.border.show([flat.border])
+            self.border.show([flat.border], look.theme)
             if self._scenario is not None:
                 self.adopt(self._scenario)
 
@@ -46,11 +45,15 @@ class MovableSlice(Picture):
         self._scenario, view = scenario, scenario.view
         if self._home is None:
             return
+        (marker,) = self.items
         pose = view.slice or self._home.pose
-        self._handles.stand(pose.position, pose.wxyz)
-        self._handles.show(view.move_slice)
+        marker.stand(pose.position, pose.wxyz)
+        marker.has_handles = view.move_slice
         self.visible = view.move_slice or view.slice is not None
 
-    def without_handles(self) -> AbstractContextManager[None]:
-        """Hide the handles, not the frame, while a picture is made."""
-        return self._handles.hidden()
+    def _new(self, index: int) -> Marker:
+        return Marker(self, self.node, scale=0.24)
+
+    def _move(self, session: Session, marker: Marker, position: Array, wxyz: Array) -> None:
+        pose = SlicePose(as_point(position), as_quaternion(wxyz))
+        session.edit("slice", view=replace(session.scenario.view, slice=pose))

@@ -1,4 +1,4 @@
-"""Pictures on the slice: arrows, streamlines, and det J, the Lyapunov value or the learned occupancy as colour."""
+"""Pictures of ψ and on the slice: arrows, streamlines, warped grid; det J, Lyapunov value or occupancy as colour."""
 
 from __future__ import annotations
 
@@ -12,28 +12,23 @@ from dt_viz.flows.fields import Array
 from dt_viz.pictures.slice_fields import ColourPicture
 from dt_viz.scenario.slices import Slice
 from dt_viz.session.frame import Frame
-from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.colour_scale import NUM_SHADES, Scale, diverging, ramp
-from dt_viz.ui.scene.picture import Arrows, Lines, Picture, assign
+from dt_viz.ui.scene.palette import LIGHT
+from dt_viz.ui.scene.picture import Arrows, Lines, Look, Picture, assign
+from dt_viz.ui.scene.style import STYLES
 
-ARROW_LENGTH = 0.024
-"""Length of the fastest arrow, metres."""
-HEAD_LENGTH = 0.012
-"""Length of the arrow heads on streamlines, metres."""
 PIXEL = 0.004
 """Size of a pixel of the colours, metres."""
 OPACITY, MOST_OPAQUE = 0.5, 0.85
 """Opacity of the ink of det J and the Lyapunov value, and of occupancy where it is certain."""
-POINT_SIZE = 0.0016
-"""Size of a cloud's points, metres."""
 DET_DECADES = 2
 """Number of decades of det J on either side of 1; values beyond have the last colour."""
 CM2 = 1e4
 """Square centimetres in a square metre."""
 
-VOLUME, LYAPUNOV = diverging(palette.VOLUME), ramp(palette.LYAPUNOV)
+VOLUME, LYAPUNOV = diverging(LIGHT.volume), ramp(LIGHT.lyapunov)
 _LIKELY = np.linspace(0, MOST_OPAQUE, NUM_SHADES)[:, None]
-OCCUPANCY_SCALE = Scale(np.round(255 + _LIKELY * (np.array(palette.OCCUPANCY) - 255)).astype(np.uint8), 0.0, 1.0)
+OCCUPANCY_SCALE = Scale(np.round(255 + _LIKELY * (np.array(LIGHT.occupancy) - 255)).astype(np.uint8), 0.0, 1.0)
 """Colours of the occupancy on white."""
 
 
@@ -41,16 +36,13 @@ class FieldArrows(Picture):
     """The vector field on the slice; faster arrows are longer and darker."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
-        self.arrows = Arrows(scene, "/field", palette.ARROW_SLOW, palette.ARROW_FAST, ARROW_LENGTH)
+        self.arrows = Arrows(scene, "/field", STYLES.field)
         super().__init__(self.arrows.node)
 
-    def draw(self, frame: Frame) -> None:
+    def draw(self, frame: Frame, look: Look) -> None:
         field = frame.pictures.field
         if field is not None:
-            self.arrows.show(field.points, field.velocities)
-
-    def dye(self, dark: bool) -> None:
-        self.arrows.paint(*(palette.shade(colour, dark) for colour in (palette.ARROW_SLOW, palette.ARROW_FAST)))
+            self.arrows.show(field.points, field.velocities, look.theme)
 
 
 class Streamlines(Picture):
@@ -58,23 +50,18 @@ class Streamlines(Picture):
 
     def __init__(self, scene: viser.SceneApi) -> None:
         super().__init__(scene.add_frame("/streamlines", show_axes=False))
-        self.lines = Lines(scene, "/streamlines/lines", palette.STREAMLINE, 0.0015)
-        colour = palette.linear(palette.STREAMLINE)
-        self.heads = Arrows(scene, "/streamlines/heads", colour, colour, HEAD_LENGTH)
+        self.lines = Lines(scene, "/streamlines/lines", STYLES.streamline)
+        self.heads = Arrows(scene, "/streamlines/heads", STYLES.streamline_head)
 
-    def draw(self, frame: Frame) -> None:
+    def draw(self, frame: Frame, look: Look) -> None:
         lines = frame.pictures.streamlines
         if lines is not None:
-            self.lines.show(lines)
+            self.lines.show(lines, look.theme)
             middles = [len(line) // 2 for line in lines]
             points = np.reshape([line[k] for line, k in zip(lines, middles, strict=True)], (-1, 3))
             ahead = np.reshape([line[k] - line[k - 1] for line, k in zip(lines, middles, strict=True)], (-1, 3))
-            self.heads.show(points, ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-12))
-
-    def dye(self, dark: bool) -> None:
-        self.lines.dye(dark)
-        colour = palette.linear(palette.shade(palette.STREAMLINE, dark))
-        self.heads.paint(colour, colour)
+            ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-12)
+            self.heads.show(points, ahead, look.theme)
 
 
 class _Image:
@@ -115,15 +102,13 @@ class ColourSlice(Picture):
     def __init__(self, scene: viser.SceneApi) -> None:
         super().__init__(scene.add_frame("/colour", show_axes=False))
         self.image = _Image(scene, "/colour/image")
-        self.lines = Lines(scene, "/colour/lines", palette.LEVEL_LINE, 0.0012)
-        self._shown: object = None
+        self.lines = Lines(scene, "/colour/lines", STYLES.level_line)
 
-    def draw(self, frame: Frame) -> None:
+    def draw(self, frame: Frame, look: Look) -> None:
         picture = frame.pictures.colour
-        if picture is not None and picture is not self._shown:
-            self._shown = picture
+        if picture is not None and self._is_new(picture, look.theme):
             self.image.show(picture.area, painted(picture))
-            self.lines.show_segments(picture.lines)
+            self.lines.show_segments(picture.lines, look.theme)
 
 
 def scale_of(picture: ColourPicture) -> Scale:
@@ -151,7 +136,7 @@ def painted(picture: ColourPicture) -> NDArray[np.uint8]:
     room = map_coordinates(np.minimum(picture.clearance, 1.0), at, order=1)
     pixels[..., 3] = np.round(255 * OPACITY * ink * np.clip(room / PIXEL + 0.5, 0, 1))
     if picture.what == "det":
-        pixels[map_coordinates(values, at, order=0) <= 0] = (*palette.FOLDED, 255)
+        pixels[map_coordinates(values, at, order=0) <= 0] = (*LIGHT.folded, 255)
     return pixels
 
 
@@ -177,30 +162,52 @@ class OccupancySlice(Picture):
     def __init__(self, scene: viser.SceneApi) -> None:
         super().__init__(scene.add_frame("/occupancy", show_axes=False))
         self.image = _Image(scene, "/occupancy/image")
-        self.level = Lines(scene, "/occupancy/level", palette.OCCUPANCY_LEVEL, 0.0025)
-        self.outline = Lines(scene, "/occupancy/outline", palette.OUTLINE, 0.0030)
+        self.level = Lines(scene, "/occupancy/level", STYLES.occupancy_level)
+        self.outline = Lines(scene, "/occupancy/outline", STYLES.outline)
         self.points = scene.add_point_cloud(
-            "/occupancy/points", np.zeros((0, 3), np.float32), palette.FREE, point_size=POINT_SIZE, point_shape="circle"
+            "/occupancy/points", np.zeros((0, 3), np.float32), LIGHT.free, point_size=0.0016, point_shape="circle"
         )
-        self._shown: object = None
 
-    def draw(self, frame: Frame) -> None:
+    def draw(self, frame: Frame, look: Look) -> None:
         picture = frame.pictures.occupancy
-        if picture is None or picture is self._shown:
-            return
-        self._shown = picture
-        self.image.show(picture.area, _of_probability(picture.probability))
-        self.level.show_segments(picture.level)
-        self.outline.show_segments(picture.outline)
-        colours = np.where(picture.occupied[:, None], palette.OCCUPIED, palette.FREE).astype(np.uint8)
-        assign(self.points, picture.points, colours)
-
-    def dye(self, dark: bool) -> None:
-        self.outline.dye(dark)
+        if picture is not None and self._is_new(picture, look.theme):
+            self.image.show(picture.area, _of_probability(picture.probability))
+            self.level.show_segments(picture.level, look.theme)
+            self.outline.show_segments(picture.outline, look.theme)
+            colours = np.where(picture.occupied[:, None], LIGHT.occupied, LIGHT.free).astype(np.uint8)
+            assign(self.points, picture.points, colours)
 
 
 def _of_probability(probability: Array) -> NDArray[np.uint8]:
     pixels = np.empty((*probability.shape, 4), np.uint8)
-    pixels[..., :3] = palette.OCCUPANCY
+    pixels[..., :3] = LIGHT.occupancy
     pixels[..., 3] = np.round(255 * MOST_OPAQUE * probability)
     return pixels
+
+
+class Generator(Picture):
+    """The learned generator as arrows, with the demonstrations on the manifold that it acts on."""
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        super().__init__(scene.add_frame("/generator", show_axes=False))
+        self.arrows = Arrows(scene, "/generator/arrows", STYLES.generator)
+        self._motions = Lines(scene, "/generator/motions", STYLES.generator_motion)
+
+    def draw(self, frame: Frame, look: Look) -> None:
+        picture = frame.pictures.generator
+        if picture is not None and self._is_new(picture, look.theme):
+            self.arrows.show(picture.points, picture.displacements, look.theme)
+            self._motions.show(picture.motions, look.theme)
+
+
+class WarpedGrid(Picture):
+    """Image of a grid of base space under ψ⁻¹ of the stack; thinner and paler beside the rollouts of a level."""
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        self.lines = Lines(scene, "/grid", STYLES.grid)
+        super().__init__(self.lines.node)
+
+    def draw(self, frame: Frame, look: Look) -> None:
+        if frame.pictures.grid is not None:
+            self.lines.style = STYLES.grid if frame.level is None else STYLES.grid_beside
+            self.lines.show_segments(frame.pictures.grid, look.theme)

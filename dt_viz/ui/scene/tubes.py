@@ -3,74 +3,54 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import numpy as np
 import viser
+from scipy.spatial import KDTree
 
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.metrics import interpolate
-from dt_viz.ui.scene.picture import Colour
+from dt_viz.ui.scene.palette import LIGHT, Theme
+from dt_viz.ui.scene.style import TubeStyle
 
 NUM_RINGS, NUM_SIDES = 80, 7
 """Numbers of rings along a tube, and of corners of a ring."""
-TURN = 0.03
-"""Length of a path that needs as many rings as a turn by one radian, metres."""
-BALL_RINGS = 6
-"""Number of rings of the ball at the beginning of a tube."""
+INSIDE = 0.0035
+"""Distance of a line from the middle of a rollout up to which it counts as inside its tube, metres."""
 
 
 class Tubes:
-    """Paths of one look as tubes, each with a ball at its beginning: one mesh, of which a drag moves the vertices."""
+    """Paths of one look as tubes: one mesh, of which a drag moves the vertices."""
 
-    def __init__(
-        self,
-        scene: viser.SceneApi,
-        name: str,
-        colour: Colour,
-        radius: float,
-        *,
-        ball: float = 0.0,
-        opacity: float = 1.0,
-    ) -> None:
-        """Make an empty set.
-
-        Args:
-            scene: scene of the visitor.
-            name: name in the scene tree.
-            colour: colour of all tubes.
-            radius: radius of a tube, metres.
-            ball: radius of the ball at its beginning, metres; 0 makes none.
-            opacity: from 0 to 1.
-        """
-        self._radius, self._ball = radius, ball
+    def __init__(self, scene: viser.SceneApi, name: str, style: TubeStyle) -> None:
+        """Make an empty set of this name in the scene tree."""
+        self._style = style
         self.node = scene.add_mesh_simple(
-            name, *_NOTHING, color=colour, opacity=None if opacity == 1 else opacity, cast_shadow=opacity == 1
+            name,
+            *_NOTHING,
+            color=style.on(LIGHT),
+            opacity=style.opacity,
+            cast_shadow=style.opacity is None,
         )
 
-    @property
-    def colour(self) -> Colour:
-        """Colour of all tubes."""
-        return self.node.color
-
-    @colour.setter
-    def colour(self, colour: Colour) -> None:
-        self.node.color = colour
-
-    def show(self, middles: Array, *, scale: float = 1.0) -> None:
+    def show(self, middles: Array, theme: Theme, *, scale: float = 1.0) -> None:
         """Show paths: two messages where their number changes, so the caller must hold an atomic block.
 
         Args:
             middles: (R, `NUM_RINGS`, 3), as of `middles_of`, metres.
+            theme: colours.
             scale: thickness of tubes and balls, relative to the usual one.
         """
         vertices, faces = _NOTHING
         if len(middles):
-            vertices = tubes(middles, scale * self._radius, scale * self._ball)
+            vertices = tubes(middles, scale * self._style.radius, scale * self._style.ball)
             faces = tube_faces(*vertices.shape[:3])
         if len(faces) != len(self.node.faces):
             self.node.faces = np.asarray(faces, np.uint32)
         self.node.vertices = vertices.reshape(-1, 3).astype(np.float32)
+        self.node.color = self._style.on(theme)
 
 
 _NOTHING = np.zeros((3, 3), np.float32), np.array([[0, 1, 2]])
@@ -104,7 +84,7 @@ def tubes(paths: Array, radius: float, ball: float = 0.0) -> Array:
     first, along = paths[:, :1, None], tangents[:, :1, None]
     if ball == 0:
         return np.concatenate([np.broadcast_to(first, ends.shape), rings, ends], axis=1)
-    height = np.linspace(np.pi, 0, BALL_RINGS)[None, :, None, None]
+    height = np.linspace(np.pi, 0, 6)[None, :, None, None]
     globe = first + ball * (np.cos(height) * along + np.sin(height) * ring(normals[:, :1], tangents[:, :1]))
     return np.concatenate([globe, rings, ends], axis=1)
 
@@ -125,7 +105,8 @@ def evenly_bent(path: Array, num: int = NUM_RINGS) -> Array:
     length = np.linalg.norm(pieces, axis=1)
     directions = pieces / np.maximum(length, 1e-12)[:, None]
     turn = np.linalg.norm(np.diff(directions, axis=0, prepend=directions[:1]), axis=1)
-    measure = np.concatenate([[0.0], np.cumsum(np.maximum(length + TURN * turn, 1e-12))])
+    # a turn by one radian needs as many rings as 3 cm of the path
+    measure = np.concatenate([[0.0], np.cumsum(np.maximum(length + 0.03 * turn, 1e-12))])
     return interpolate(np.linspace(0, measure[-1], num), measure, path)
 
 
@@ -138,3 +119,32 @@ def _reflected(across: Array, vectors: Array) -> Array:
     """Vectors (*B, 3) reflected in planes across others (*B, 3)."""
     size = np.maximum((across * across).sum(axis=-1, keepdims=True), 1e-18)
     return vectors - 2 * (across * vectors).sum(axis=-1, keepdims=True) / size * across
+
+
+@dataclass(frozen=True, eq=False)
+class RolloutTubes:
+    """Where the tubes of a frame's rollouts lie, computed once for all that is drawn beside them."""
+
+    rollouts: tuple[Array, ...] = ()
+    """(T_i, 3), metres."""
+    shown: bool = True
+    """Whether the tubes are shown; hidden ones cover nothing."""
+
+    @cached_property
+    def middles(self) -> Array:
+        """Middles (R, `NUM_RINGS`, 3) of the tubes' rings, metres."""
+        return middles_of(self.rollouts)
+
+    @cached_property
+    def _samples(self) -> KDTree:
+        """Points along the middles, a few millimetres apart."""
+        part = np.arange(5)[:, None] / 5
+        pieces = self.middles[:, :-1, None] + part * np.diff(self.middles, axis=1)[:, :, None]
+        return KDTree(np.concatenate([pieces.reshape(-1, 3), self.middles[:, -1]]))
+
+    def outside(self, segments: Array, distance: float = INSIDE) -> Array:
+        """Return those of the segments (K, 2, 3) farther than a distance from the middles, all in metres."""
+        if not self.shown or not self.rollouts:
+            return segments
+        away, _ = self._samples.query(segments.mean(axis=1), distance_upper_bound=distance)
+        return segments[np.isinf(away)]

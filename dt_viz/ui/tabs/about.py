@@ -12,7 +12,7 @@ import viser
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.scene import palette
-from dt_viz.ui.scene.picture import Colour
+from dt_viz.ui.scene.palette import Colour
 from dt_viz.ui.tabs.plots import small
 
 TITLE = "Diffeomorphic Transforms for Generalised Imitation Learning"
@@ -20,14 +20,14 @@ AUTHORS = "Weiming Zhi, Tin Lai, Lionel Ott, Fabio Ramos"
 VENUE = "Learning for Dynamics and Control (L4DC), 2022"
 LINK = "https://proceedings.mlr.press/v168/zhi22a.html"
 LEGEND: Mapping[str, Colour] = {
-    "demonstrations": palette.DEMONSTRATION,
-    "rollouts; the bold one is the arm’s": palette.ROLLOUT,
-    "rollouts from added starts": palette.ADDED,
-    "undisturbed motions": palette.GHOST,
-    "way of the robot": palette.WAY,
-    "obstacles": palette.OBSTACLE,
-    "bias points": palette.BIAS,
-    "goal": palette.GOAL,
+    "demonstrations": palette.LIGHT.demonstration,
+    "rollouts; the bold one is the arm’s": palette.LIGHT.rollout,
+    "rollouts from added starts": palette.LIGHT.added,
+    "undisturbed motions": palette.LIGHT.ghost,
+    "way of the robot": palette.LIGHT.way,
+    "obstacles": palette.LIGHT.obstacle,
+    "bias points": palette.LIGHT.bias,
+    "goal": palette.LIGHT.goal,
 }
 """What is drawn, with its colour."""
 PAGES = {"pageup": "Page Up", "pagedown": "Page Down"}

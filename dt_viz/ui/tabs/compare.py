@@ -126,12 +126,12 @@ def _row(compared: Compared) -> str:
 
 def _cell(metres: float | None, *, bad: bool) -> str:
     text = NONE if metres is None else f"{1e3 * metres:.0f}"
-    colour = f";color:{palette.ink(palette.FOLDED)}" if bad else ""
+    colour = f";color:{palette.ink(palette.LIGHT.folded)}" if bad else ""
     return f"<td style='{_CELL}{colour}'>{text}</td>"
 
 
 def _colour(name: str) -> tuple[int, int, int]:
-    return COLOURS.get(name, palette.ROLLOUT)
+    return COLOURS.get(name, palette.LIGHT.rollout)
 
 
 def _curves(names: Sequence[str]) -> tuple[uplot.Series, ...]:

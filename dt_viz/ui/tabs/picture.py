@@ -11,9 +11,8 @@ import viser
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.controls import Control, on_press, switch
-from dt_viz.ui.scene.camera import HAND, HOME, PANEL, VIEWS
+from dt_viz.ui.scene.camera import HAND, HOME, VIEWS, CameraController, Framing
 from dt_viz.ui.scene.export import RESOLUTIONS
-from dt_viz.ui.scene.tripod import Tripod
 from dt_viz.ui.tabs.about import Command
 
 LARGER = 1.4
@@ -49,7 +48,7 @@ class PictureTab:
         self,
         gui: viser.GuiApi,
         bindings: Bindings,
-        tripod: Tripod,
+        tripod: CameraController,
         presentation: Presentation,
         *,
         darken: Callable[[bool], None],
@@ -117,7 +116,7 @@ class PictureTab:
 class BigType:
     """Size of the type of one visitor's page, and width of the panel."""
 
-    def __init__(self, gui: viser.GuiApi, tripod: Tripod) -> None:
+    def __init__(self, gui: viser.GuiApi, tripod: CameraController) -> None:
         """Begin with the usual size; must be built outside tabs and folders, of which closed ones have no style."""
         # viser measures its page in rem or em, of 92.5 % of the browser's type; on a phone the panel fills the window
         style = f"<style>@media (min-width: 577px) {{ :root {{ font-size: {92.5 * LARGER}%; }} }}</style>"
@@ -129,7 +128,7 @@ class BigType:
         wider = (LARGER - 1) * usual if on else 0.0
         self._style.visible = on
         self._panel.set_width(usual + wider)
-        self._tripod.panel = PANEL + wider
+        self._tripod.reframe(panel=Framing.panel + wider)
 
 
 class Presentation:

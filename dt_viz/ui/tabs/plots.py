@@ -16,8 +16,8 @@ from dt_viz.motion.profiles import Profiles
 from dt_viz.robot.robot import NUM_JOINTS, Robot
 from dt_viz.session.engine import ArmMotion
 from dt_viz.ui.scene import palette
-from dt_viz.ui.scene.palette import css
-from dt_viz.ui.scene.picture import Colour, Following, Shown
+from dt_viz.ui.scene.palette import Colour, css
+from dt_viz.ui.scene.picture import Following, Shown
 
 NUM_SAMPLES = 80
 """Number of samples of a curve over time, few enough to be sent during a drag."""
@@ -117,13 +117,13 @@ class JointPlots(Following):
         self._robot = robot
         limited = [j for j in range(NUM_JOINTS) if np.isfinite(robot.lower[j])]
         self._limits = np.degrees(np.stack([robot.lower[limited], robot.upper[limited]], axis=1)).ravel()
-        joints = [curve(f"{j}", colour) for j, colour in enumerate(palette.JOINTS, start=1)]
-        limits = [curve("limit", palette.JOINTS[j], width=1, dashed=True) for j in limited for _ in range(2)]
-        limit = curve("limit", palette.ARM_RING, width=1, dashed=True)
+        joints = [curve(f"{j}", colour) for j, colour in enumerate(palette.LIGHT.joints, start=1)]
+        limits = [curve("limit", palette.LIGHT.joints[j], width=1, dashed=True) for j in limited for _ in range(2)]
+        limit = curve("limit", palette.LIGHT.arm_ring, width=1, dashed=True)
         folder = gui.add_folder("Joints", visible=False)
         super().__init__(folder)
         with folder:
-            marks = {f"{j}": f"background:{css(colour)}" for j, colour in enumerate(palette.JOINTS, start=1)}
+            marks = {f"{j}": f"background:{css(colour)}" for j, colour in enumerate(palette.LIGHT.joints, start=1)}
             gui.add_html(legend(marks, "0.3em", "Joint"))
             self.angles = add_plot(gui, "Angle [°]; dashed: limits", "t [s]", (*joints, *limits), 170)
             title = f"Speed [% of its limit], up to {MAX_SPEED}; time [s]"
@@ -147,15 +147,15 @@ class HealthPlots(Shown):
         super().__init__(folder)
         with folder:
             self.table = gui.add_html("")
-            line = f"border-top:2px {{}} {css(palette.ARM_RING)}"
+            line = f"border-top:2px {{}} {css(palette.LIGHT.arm_ring)}"
             marks = {"with avoidance and biases": line.format("solid"), "without": line.format("dashed")}
             gui.add_html(legend(marks, "0", note="along the path, 0: start, 1: goal"))
-            self.lyapunov = self._plot(gui, "Lyapunov value, relative to that of the start", palette.LEVEL)
+            self.lyapunov = self._plot(gui, "Lyapunov value, relative to that of the start", palette.LIGHT.level)
             self._to = gui.add_html("")
-            self.distance = self._plot(gui, "", palette.ROLLOUT)
+            self.distance = self._plot(gui, "", palette.LIGHT.rollout)
             self._whose = gui.add_html("")
-            contact = curve("contact", palette.ARM_RING, width=1)
-            self.clearance = self._plot(gui, "", palette.GOAL, contact)
+            contact = curve("contact", palette.LIGHT.arm_ring, width=1)
+            self.clearance = self._plot(gui, "", palette.LIGHT.goal, contact)
 
     def _plot(self, gui: viser.GuiApi, title: str, colour: Colour, *more: uplot.Series) -> viser.GuiUplotHandle:
         """Add a plot of the pair of curves, and more curves."""

@@ -34,8 +34,8 @@ from dt_viz.session.frame import Frame
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.scene import palette
-from dt_viz.ui.scene.levels import manifold
-from dt_viz.ui.scene.picture import Colour
+from dt_viz.ui.scene.palette import Colour
+from dt_viz.ui.scene.rollouts import manifold
 from dt_viz.ui.tabs.plots import small
 from dt_viz.ui.tabs.settings import add_settings, settings_of_purpose
 
@@ -46,7 +46,7 @@ SECONDS = 5.0
 """Duration of playing the warp."""
 NO_STYLE = "–"
 
-_COLOURS: Mapping[type[Transform], Colour] = {Avoidance: palette.OBSTACLE, BiasPoint: palette.BIAS}
+_COLOURS: Mapping[type[Transform], Colour] = {Avoidance: palette.LIGHT.obstacle, BiasPoint: palette.LIGHT.bias}
 """Colours of kinds of transforms in the formula; those of what is drawn of them."""
 
 
@@ -140,9 +140,8 @@ def legend_html(scenario: Scenario) -> str:
     """Return a legend of the selected level's lines; empty if none is selected."""
     if scenario.view.level not in levels(scenario):
         return ""
-    swatch = (
-        f"display:inline-block;width:1.6em;height:0.28em;vertical-align:middle;background:{palette.css(palette.LEVEL)}"
-    )
+    colour = palette.css(palette.LIGHT.level)
+    swatch = f"display:inline-block;width:1.6em;height:0.28em;vertical-align:middle;background:{colour}"
     return small(
         f"<span style='{swatch}'></span> {html.escape(manifold(scenario))}, without what is stacked on it: rollouts, "
         "and all that lies on the slice. Pale: rollouts of the whole stack"
@@ -154,14 +153,14 @@ def formula_html(scenario: Scenario) -> str:
 
     The whole arm avoids in the space of its joints q, from which forward kinematics leads to the end effector.
     """
-    parts = [(IMITATION, _part("i", palette.LEVEL))] if scenario.imitation else []
+    parts = [(IMITATION, _part("i", palette.LIGHT.level))] if scenario.imitation else []
     for _, layer in scenario.active:
-        colour = _COLOURS.get(type(layer.transform), palette.STREAMLINE)
+        colour = _COLOURS.get(type(layer.transform), palette.LIGHT.streamline)
         parts.append((layer.name, _part(_index(layer.name), colour)))
     inner = "y"
     names = [f"{part} {html.escape(name)}" for name, part in parts]
     if scenario.arm_avoidance is not None and scenario.obstacles:
-        whole = _part("q", palette.WAY)
+        whole = _part("q", palette.LIGHT.way)
         inner, names = f"fk({whole}(q))", [*names, f"{whole} {WHOLE_ARM}"]
     formula = "".join(f"{part}(" for _, part in parts) + inner + ")" * len(parts)
     legend = small(" · ".join((f"z {BASE}", *names)))

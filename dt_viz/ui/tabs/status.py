@@ -14,8 +14,7 @@ from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.progress import Pace, Progress
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import Bindings
-from dt_viz.ui.scene.palette import ink, paper
-from dt_viz.ui.scene.picture import Colour
+from dt_viz.ui.scene.palette import Colour, ink, paper
 from dt_viz.ui.tabs.plots import small
 from dt_viz.ui.tabs.verdict import Verdict, concerns, remedy, shows_arm, verdict
 from dt_viz.warning import MotionWarning, Severity, in_millimetres
