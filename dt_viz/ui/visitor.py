@@ -60,8 +60,7 @@ class Visitor(Display):
         self.client = client
         self.shown: Frame | None = None
         """The last drawn frame."""
-        self._theme = LIGHT
-        self._set_theme()
+        self._dress(LIGHT)
         client.gui.set_panel_label("DT-Viz")
         with client.atomic():
             self.pictures = ScenePictures(client.scene, robot, lambda: self.session)
@@ -119,21 +118,23 @@ class Visitor(Display):
         self._camera.turn(now)
         self.robot.pose(now, self.pictures.look.tubes)
 
-    def _set_theme(self) -> None:
+    def _dress(self, theme: Theme) -> None:
+        """Show the panel in a theme."""
+        self._theme = theme
         self.client.gui.configure_theme(
-            dark_mode=self._theme is DARK, show_logo=False, show_share_button=False, brand_color=LIGHT.brand
+            dark_mode=theme is DARK, show_logo=False, show_share_button=False, brand_color=LIGHT.brand
         )
 
     def _darken(self, dark: bool) -> None:
         """Begin the dark theme, or the light one, on the panel and in the scene."""
-        self._theme = DARK if dark else LIGHT
-        self._set_theme()
+        self._dress(DARK if dark else LIGHT)
         self._paint(self._theme)
 
     def _paint(self, theme: Theme) -> None:
-        """Draw the scene in the colours of a theme."""
+        """Show the scene in a theme."""
         with self.client.atomic():
-            self.pictures.theme = self.robot.theme = theme
+            self.pictures.paint(theme)
+            self.robot.paint(theme)
 
     @contextmanager
     def _light(self) -> Iterator[None]:

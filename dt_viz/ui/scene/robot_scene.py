@@ -42,13 +42,8 @@ class RobotScene:
         q = self.playback.arm.q
         return None if q is None else self._robot.end_effector(q)
 
-    @property
-    def theme(self) -> Theme:
-        """Colours of what is drawn."""
-        return self._theme
-
-    @theme.setter
-    def theme(self, theme: Theme) -> None:
+    def paint(self, theme: Theme) -> None:
+        """Take the colours of a theme."""
         self._theme = theme
         for lines in (self.path.ahead, self.carried.drawing.ink):
             lines.paint(theme)

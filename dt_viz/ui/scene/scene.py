@@ -131,18 +131,12 @@ class ScenePictures:
         if self._wanted_look() != self.look:
             self._redraw()
 
-    @property
-    def theme(self) -> Theme:
-        """Colours of everything; others draw the last frame again."""
-        return self._theme
-
-    @theme.setter
-    def theme(self, theme: Theme) -> None:
-        if theme is self._theme:
-            return
-        self._theme = theme
-        cast(Stage, self._by_view["table"]).paint(theme)
-        self._redraw()
+    def paint(self, theme: Theme) -> None:
+        """Draw the last frame again in the colours of another theme."""
+        if theme is not self._theme:
+            self._theme = theme
+            cast(Stage, self._by_view["table"]).paint(theme)
+            self._redraw()
 
     def _redraw(self) -> None:
         with self._drawing:
