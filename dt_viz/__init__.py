@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from dt_viz.errors import DataError, FormatError
     from dt_viz.flows.diffeomorphisms import Integration
     from dt_viz.learning.demonstrations import Demonstration, load_demonstrations
+    from dt_viz.learning.imitation import ImitationSettings
+    from dt_viz.learning.patterns import AugmentedSettings
     from dt_viz.learning.preparation import ImitationError
     from dt_viz.library import Arm, BlockedError, Controller, HandController, JointPath, Motion, Path, fit, load_jaco
     from dt_viz.motion.certificates import Certificates
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Arm",
+    "AugmentedSettings",
     "Avoidance",
     "BiasPoint",
     "BlockedError",
@@ -41,6 +44,7 @@ __all__ = [
     "FormatError",
     "HandController",
     "ImitationError",
+    "ImitationSettings",
     "Integration",
     "JointPath",
     "Motion",
@@ -57,6 +61,8 @@ _MODULES = {
     "errors": ("DataError", "FormatError"),
     "flows.diffeomorphisms": ("Integration",),
     "learning.demonstrations": ("Demonstration", "load_demonstrations"),
+    "learning.imitation": ("ImitationSettings",),
+    "learning.patterns": ("AugmentedSettings",),
     "learning.preparation": ("ImitationError",),
     "library": (
         "Arm",

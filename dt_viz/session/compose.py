@@ -12,7 +12,6 @@ from dt_viz.flows.diffeomorphisms import Chain, Flow, Identity
 from dt_viz.flows.fields import Array
 from dt_viz.flows.rollouts import Bundle
 from dt_viz.flows.systems import DiffeomorphicSystem
-from dt_viz.learning.augmented import AugmentedImitation
 from dt_viz.motion.certificates import Certificates
 from dt_viz.motion.diagnostics import anchor_warnings, motion_warnings, target_warnings
 from dt_viz.motion.following import ArmMotion, Follower, arm_samples, far_starts, unreachable
@@ -70,8 +69,8 @@ def rollouts_frame(scenario: Scenario, solved: Solved, follower: Follower) -> Fr
         num_added=nominal.num_added,
         blocked=(),
         certificates=Certificates(clearance, found=warnings),
-        remembers=isinstance(nominal.imitation, AugmentedImitation),
-        reason=nominal.imitation.reason if isinstance(nominal.imitation, AugmentedImitation) else "",
+        remembers=nominal.imitation.state == "augmented",
+        reason=nominal.imitation.reason,
         labels=nominal.learned.demonstrated_labels,
         learned_steps=_learned_steps(nominal),
         durations=tuple(applied.made.duration if applied else None for applied in made),

@@ -11,7 +11,7 @@ from dt_viz.errors import Cancelled, never
 from dt_viz.flows.augmented_systems import frozen
 from dt_viz.flows.fields import Array
 from dt_viz.flows.rollouts import Rays
-from dt_viz.learning.augmented import AugmentedImitation
+from dt_viz.learning.augmented import fit_augmented
 from dt_viz.learning.imitation import ImitationSettings, Progress
 from dt_viz.learning.store import FitStore
 from dt_viz.learning.style import Style
@@ -198,16 +198,11 @@ class Engine:
     def _styled(self, scenario: Scenario) -> Learned:
         """What is learned for a scenario in the augmented state, in its style."""
         own, usual, other = (
-            self.memo("augmented", name, lambda name=name: self._augmented(name))
+            self.memo("augmented", name, lambda name=name: fit_augmented(self.task(name).demonstrations))
             for name in (scenario.task, *STYLES[scenario.style])
         )
         imitation = Style.between(usual, other).on(own, scenario.style_amount)
         return Learned.of(self.task(scenario.task), imitation, imitates=True)
-
-    def _augmented(self, task: str) -> AugmentedImitation:
-        imitation = self._fits.learned(self.task(task).demonstrations, state="augmented")
-        assert isinstance(imitation, AugmentedImitation)
-        return imitation
 
     def _admission(self, scenario: Scenario, precision: Precision) -> Admission:
         """Whether the scenario has a motion, and from which starts.
