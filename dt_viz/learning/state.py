@@ -13,6 +13,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache
 
 from dt_viz.learning.augmented import fit_augmented
 from dt_viz.learning.demonstrations import Demonstration
@@ -28,7 +29,7 @@ def learn(
     state: State = "auto",
     labels: Sequence[float] | None = None,
     progress: Progress | None = None,
-    plain: Callable[[ImitationSettings | None], Imitation] | None = None,
+    plain: Callable[[ImitationSettings], Imitation] | None = None,
     augmented: AugmentedSettings | None = None,
 ) -> AnyImitation:
     """Learn a stable motion in the state that is asked for.
@@ -49,7 +50,8 @@ def learn(
         raise ImitationError(f"state: found {state!r}; accepted: {', '.join(STATES)}")
     if state == "plain" and labels is not None:
         raise ImitationError("labels: found some; accepted: none in the plain state")
-    plain = plain or (lambda settings: fit(demonstrations, settings, progress))
+    settings = settings or ImitationSettings()
+    plain = cache(plain or (lambda settings: fit(demonstrations, settings, progress)))
     if state == "plain":
         return plain(settings)
     reason = ""
@@ -60,9 +62,7 @@ def learn(
     return fit_augmented(demonstrations, labels, augmented, reason)
 
 
-def why_augmented(
-    demonstrations: Sequence[Demonstration], plain: Callable[[ImitationSettings | None], Imitation]
-) -> str:
+def why_augmented(demonstrations: Sequence[Demonstration], plain: Callable[[ImitationSettings], Imitation]) -> str:
     """Why demonstrations are to be learned in the augmented state; empty where the plain one draws them.
 
     Args:

@@ -20,9 +20,9 @@ from dt_viz.scenario.tasks import TASKS
 STATES = ("plain", "augmented")
 NOISE = 1e-12
 """Deviation of demonstrations that are the same but for rounding, relative to their extent."""
-ALIKE = 1e-6
+ALIKE = 1e-5
 """Largest distance of motions that are the same but for rounding, relative to the extent: what rounding grows to in a
-fit that turns far, with room to spare."""
+fit that turns far or has to leave a symmetric saddle, as of mirrored demonstrations, with room to spare."""
 BESIDE = 0.02
 """Deviation of starts beside the demonstrated ones, relative to the extent."""
 FITTED_ELSEWHERE = ("draw_s", "draw_g", "push_box")
