@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
@@ -262,7 +262,9 @@ def _fit_trajectories(motions: Motions, settings: ImitationSettings, progress: P
 
     for weight in dict.fromkeys((regularisation, settings.regularisation)):  # from as smooth a fit as the guess
         problem = TrajectoryFit(chain, normalised, importance, weight, settings.min_determinant)
-        thetas, ends = problem.solve(thetas, ends, max_iterations=settings.max_iterations, report=report)
+        solve = partial(problem.solve, thetas, ends, max_iterations=settings.max_iterations, report=report)
+        found = solve(refuses=False)
+        thetas, ends = solve(refuses=True) if problem.folds(found[0]) else found
     return chain.transform(thetas, centre, scale)
 
 

@@ -56,6 +56,7 @@ class TrajectoryFit:
         ends: Array,
         *,
         max_iterations: int,
+        refuses: bool,
         tolerance: float = 1e-3,
         report: Callable[[int, float], None] | None = None,
     ) -> tuple[list[Array], Array]:
@@ -64,6 +65,7 @@ class TrajectoryFit:
         Args:
             thetas: initial coefficients, one array (m_l, d) for each layer, that fold nothing.
             ends: initial images.
+            refuses: whether a step that folds is refused, which is looked at after each; without, the result may fold.
             max_iterations: largest number of Gauss–Newton iterations.
             tolerance: relative decrease of the cost below which the iteration stops.
             report: called with the iteration and the root mean square distance; an exception that it raises ends the
@@ -90,7 +92,7 @@ class TrajectoryFit:
                     damping *= 8
                     continue
                 trial = self._cost(vector + step, weights)
-                if trial < cost and self._unfolded(vector + step):
+                if trial < cost and not (refuses and self.folds(self.chain.split(vector + step))):
                     vector, cost, accepted = vector + step, trial, True
                     damping = max(damping / 5, 1e-3)
                     break
@@ -99,8 +101,9 @@ class TrajectoryFit:
                 break
         return self.chain.split(vector), vector[sum(self.chain.sizes) :].reshape(ends.shape)
 
-    def _unfolded(self, vector: Array) -> bool:
-        return self.chain.min_step_determinant(self.chain.split(vector)) > self.min_determinant
+    def folds(self, thetas: Sequence[Array]) -> bool:
+        """Whether some step of the chain with these coefficients folds space, or nearly does."""
+        return self.chain.min_step_determinant(thetas) <= self.min_determinant
 
     def _prior(self, size: int) -> Array:
         prior = np.full(size, self.regularisation)
