@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from dt_viz.errors import DataError, FormatError
     from dt_viz.flows.diffeomorphisms import Integration
     from dt_viz.learning.demonstrations import Demonstration, load_demonstrations
+    from dt_viz.learning.imitation import ImitationSettings
+    from dt_viz.learning.patterns import AugmentedSettings
     from dt_viz.learning.preparation import ImitationError
     from dt_viz.library.arm import Arm, BlockedError, Controller, JointPath, load_jaco
     from dt_viz.library.hand import HandController
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Arm",
     "ArmAvoidance",
+    "AugmentedSettings",
     "Avoidance",
     "BiasPoint",
     "BlockedError",
@@ -49,6 +52,7 @@ __all__ = [
     "HandAvoidance",
     "HandController",
     "ImitationError",
+    "ImitationSettings",
     "Integration",
     "JointPath",
     "Motion",
@@ -67,6 +71,8 @@ _MODULES = {
     "errors": ("DataError", "FormatError"),
     "flows.diffeomorphisms": ("Integration",),
     "learning.demonstrations": ("Demonstration", "load_demonstrations"),
+    "learning.imitation": ("ImitationSettings",),
+    "learning.patterns": ("AugmentedSettings",),
     "learning.preparation": ("ImitationError",),
     "library.arm": ("Arm", "BlockedError", "Controller", "JointPath", "load_jaco"),
     "library.hand": ("HandController",),

@@ -14,7 +14,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from types import UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
@@ -28,11 +28,12 @@ from dt_viz.avoidance.transform import Transform
 from dt_viz.errors import DataError, FormatError, check_between, parsing
 from dt_viz.files.checks import read_bytes
 from dt_viz.files.npz import arrays_of, npz_bytes, write_whole
-from dt_viz.learning.augmented import AugmentedImitation
+from dt_viz.learning.augmented import AugmentedImitation, fit_augmented
 from dt_viz.learning.demonstrations import MAX_COORDINATE, Demonstration, check_demonstrations
 from dt_viz.learning.imitation import Imitation
+from dt_viz.learning.interface import AnyImitation
+from dt_viz.learning.patterns import AugmentedSettings
 from dt_viz.learning.preparation import ImitationError
-from dt_viz.learning.state import AnyImitation, learn
 from dt_viz.obstacles.shapes import SHAPES, Obstacle
 from dt_viz.scenario.scenario import Layer
 
@@ -69,6 +70,8 @@ class SavedMotion:
     """Labels of the demonstrations, of the augmented state."""
     reason: str = ""
     """Why it was learned in the augmented state, if nobody asked for that."""
+    settings: AugmentedSettings = field(default_factory=AugmentedSettings)
+    """Settings of the augmented state."""
 
 
 def save_motion(path: str | os.PathLike[str], motion: SavedMotion, imitation: AnyImitation) -> None:
@@ -82,8 +85,7 @@ def save_motion(path: str | os.PathLike[str], motion: SavedMotion, imitation: An
     with parsing(MotionError, path, "motion", "what Motion.load can read"):
         plain = {"version": FORMAT, **_plain(motion, "motion", arrays)}
         text = json.dumps(plain, default=lambda number: number.item())  # numpy's
-    plain = imitation.to_arrays() if isinstance(imitation, Imitation) else {}
-    learned = {LEARNED + name: array for name, array in plain.items()}
+    learned = {LEARNED + name: array for name, array in imitation.to_arrays().items()}
     content = npz_bytes({TEXT: np.array(text)} | learned | arrays)
     read_motion(content, path)  # what could not be read is refused now
     write_whole(path, content)
@@ -136,11 +138,9 @@ def read_motion(content: bytes, source: str | Path) -> tuple[SavedMotion, AnyImi
 def _again(motion: SavedMotion) -> AugmentedImitation:
     """Learn a motion again. Raises FormatError where that fails."""
     try:
-        imitation = learn(motion.demonstrations, state="augmented", labels=motion.labels)
+        return fit_augmented(motion.demonstrations, motion.labels, motion.settings, motion.reason)
     except ImitationError as error:
         raise FormatError("demonstrations", str(error), "some that a motion is learned from") from error
-    assert isinstance(imitation, AugmentedImitation)
-    return replace(imitation, reason=motion.reason)
 
 
 def _plain(value: Any, where: str, arrays: dict[str, np.ndarray]) -> Any:  # noqa: ANN401 - what JSON can hold

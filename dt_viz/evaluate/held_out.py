@@ -20,16 +20,14 @@ import numpy as np
 
 from dt_viz.flows.fields import Array
 from dt_viz.flows.systems import DiffeomorphicSystem
-from dt_viz.learning.augmented import AugmentedImitation
 from dt_viz.learning.demonstrations import Demonstration
-from dt_viz.learning.imitation import Imitation
+from dt_viz.learning.interface import AnyImitation
 from dt_viz.metrics import arc_length, discrete_frechet, resample_by_arc_length, rms_at_equal_times
 
 WAYS = ("learned", "mean", "nearest")
 AT_GOAL = 5e-5
 """Distance from the goal at which a rollout ends, metres."""
-Learned = Imitation | AugmentedImitation
-Learn = Callable[[Sequence[Demonstration]], Learned]
+Learn = Callable[[Sequence[Demonstration]], AnyImitation]
 NUM_COMPARED = 400
 """Number of points, evenly by arc length, between which a Fréchet distance is computed."""
 
@@ -115,7 +113,7 @@ def _shifted(start: Array, path: Array, progress: Array, duration: float) -> tup
     return shifted_to(start, path), duration * np.interp(even, progress, even)
 
 
-def begun(imitation: Learned, start: Array) -> tuple[DiffeomorphicSystem, Array]:
+def begun(imitation: AnyImitation, start: Array) -> tuple[DiffeomorphicSystem, Array]:
     """The system of a motion from a start (d,), metres, and the state in which it begins there."""
     return imitation.system, imitation.system.base.states(start)
 
@@ -126,7 +124,7 @@ def path_from(system: DiffeomorphicSystem, state: Array, dim: int, num: int = NU
     return system.transform.inverse(z)[:, :dim]
 
 
-def rollouts_from(imitation: Learned, starts: Array) -> tuple[Array, Array]:
+def rollouts_from(imitation: AnyImitation, starts: Array) -> tuple[Array, Array]:
     """Return learned motions (R, T, d) from `starts` (R, d), metres, up to the goal, and their times (R, T), s."""
     rollouts, all_times = [], []
     for start in starts:

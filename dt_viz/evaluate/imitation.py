@@ -36,13 +36,13 @@ import numpy as np
 
 from dt_viz.evaluate import figures
 from dt_viz.evaluate.figures import FigurePanel
-from dt_viz.evaluate.held_out import WAYS, Followed, Learn, Learned, begun, follow, frechet, rollouts_from
+from dt_viz.evaluate.held_out import WAYS, Followed, Learn, begun, follow, frechet, rollouts_from
 from dt_viz.evaluate.options import InputError, ready_folder, report, whole_number, write_json, write_npz
 from dt_viz.flows.diffeomorphisms import min_det_jacobian, round_trip_error
 from dt_viz.flows.fields import Array
-from dt_viz.learning.augmented import AugmentedImitation
 from dt_viz.learning.demonstrations import METRES_PER_LASA_UNIT, Demonstration, load_demonstrations
 from dt_viz.learning.imitation import OBJECTIVES, ImitationError, ImitationSettings, fit, grown_grid
+from dt_viz.learning.interface import AnyImitation
 from dt_viz.learning.state import learn as learn_in_state
 from dt_viz.metrics import rms_at_equal_times
 
@@ -152,7 +152,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def measured(
-    imitation: Learned, source: Source, fit_seconds: float
+    imitation: AnyImitation, source: Source, fit_seconds: float
 ) -> tuple[ImitationFigures, dict[str, Any], tuple[Array, ...]]:
     """Follow all demonstrations; the row of the table, the arrays of the file, and the rollouts (T, d), metres."""
     paths, unit = _paths(source), source.unit
@@ -187,18 +187,19 @@ def measured(
     return figures, arrays, tuple(rollouts)
 
 
-def _states(imitation: Learned, paths: Sequence[Array]) -> Array:
+def _states(imitation: AnyImitation, paths: Sequence[Array]) -> Array:
     """States (N, d) of the certificates' grid; augmented ones at each of several phases."""
-    grid, num_phases = grown_grid(np.concatenate(paths), 101 if len(imitation.goal) == 2 else 25), 7
-    if not isinstance(imitation, AugmentedImitation):
-        return grid
-    states = np.tile(imitation.states(imitation.starts[0]), (num_phases * len(grid), 1))
-    states[:, : imitation.dim] = np.tile(grid, (num_phases, 1))
-    states[:, imitation.dim] = np.repeat(np.linspace(0, imitation.top, num_phases), len(grid))
+    dim = len(imitation.goal)
+    grid = grown_grid(np.concatenate(paths), 101 if dim == 2 else 25)
+    _, begin = begun(imitation, imitation.starts[0])
+    num = 7 if len(begin) > dim else 1
+    states = np.tile(begin, (num * len(grid), 1))
+    states[:, :dim] = np.tile(grid, (num, 1))
+    states[:, dim : dim + 1] *= np.repeat(np.linspace(0, 1, num), len(grid))[:, None]
     return states
 
 
-def _seconds_for(imitation: Learned, start: Array) -> float:
+def _seconds_for(imitation: AnyImitation, start: Array) -> float:
     """Measure how long the motion from a start (d,) takes to be known, by one that has kept nothing."""
     began = time.perf_counter()
     system, state = begun(replace(imitation), start)

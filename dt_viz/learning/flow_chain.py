@@ -66,10 +66,14 @@ class FlowLayer:
 
     def features(self, s: Array) -> Array:
         """Compute Φ (N, m) at the points `s` (N, d)."""
-        return self._products([f[0] for f in self.grid.factors(s)]) @ self.whitening
+        return self.gaussians(s) @ self.whitening
 
-    def features_with_derivatives(self, s: Array) -> tuple[Array, list[Array]]:
-        """Compute the raw Gaussians k(s, ŝ) (N, m) at the points `s` (N, d), and their d partial derivatives."""
+    def gaussians(self, s: Array) -> Array:
+        """Compute the raw Gaussians k(s, ŝ) (N, m) at the points `s` (N, d)."""
+        return self._products([factor[0] for factor in self.grid.factors(s)])
+
+    def gaussians_with_derivatives(self, s: Array) -> tuple[Array, list[Array]]:
+        """Compute the raw Gaussians (N, m) at the points `s` (N, d), and their d partial derivatives."""
         factors = self.grid.factors(s, 1)
         value = self._products([f[0] for f in factors])
         d = self.grid.dim
@@ -91,7 +95,7 @@ class FlowLayer:
 
 
 @dataclass(frozen=True)
-class Stack:
+class FlowChain:
     """ψ⁻¹ as a chain of layers; layer 0 acts first. Coefficients are lists of L arrays (m_l, d)."""
 
     layers: tuple[FlowLayer, ...]
@@ -117,20 +121,20 @@ class Stack:
         """Join the coefficients of all layers: the inverse of `split`."""
         return np.concatenate([theta.T.reshape(-1) for theta in thetas])
 
-    def inverse(self, z: Array, thetas: Sequence[Array]) -> Array:
-        """Compute ψ⁻¹(z), (N, d)."""
+    def images(self, z: Array, thetas: Sequence[Array]) -> Array:
+        """Compute the images (N, d) of points `z` (N, d)."""
         h = 1.0 / self.steps
         for layer, theta in zip(self.layers, thetas, strict=True):
             raw = layer.whitening @ theta
             for _ in range(self.steps):
-                z = z + h * (layer._products([f[0] for f in layer.grid.factors(z)]) @ raw)
+                z = z + h * (layer.gaussians(z) @ raw)
         return z
 
-    def inverse_with_sensitivity(self, z: Array, thetas: Sequence[Array]) -> tuple[Array, Array, Array]:
-        """Compute ψ⁻¹ and its derivatives.
+    def images_with_sensitivity(self, z: Array, thetas: Sequence[Array]) -> tuple[Array, Array, Array]:
+        """Compute the images of points `z` (N, d) and their derivatives.
 
         Returns:
-            ψ⁻¹(z) (N, d), its derivative by z (N, d, d), and its derivative by the unknowns (N, d, P), ordered as in
+            The images (N, d), their derivative by z (N, d, d), and that by the unknowns (N, d, P), ordered as in
             `join`: the sum over steps of (product of the later steps' Jacobians)·h·Φ(s).
         """
         h, d = 1.0 / self.steps, self.dim
@@ -138,7 +142,7 @@ class Stack:
         for layer, theta in zip(self.layers, thetas, strict=True):
             raw = layer.whitening @ theta
             for _ in range(self.steps):
-                value, partials = layer.features_with_derivatives(z)
+                value, partials = layer.gaussians_with_derivatives(z)
                 z = z + h * (value @ raw)
                 path.append((value, np.eye(d) + h * np.stack([p @ raw for p in partials], axis=-1)))
         sensitivity = np.empty((d, len(z), sum(self.sizes)))
@@ -164,7 +168,7 @@ class Stack:
         return min(min_step_determinant(layer.field(theta), 1.0 / self.steps) for layer, theta in pairs)
 
     def transform(self, thetas: Sequence[Array], centre: Array, scale: float) -> Chain:
-        """Return ψ in the user's coordinates y = centre + scale·s, with an inverse exact to rounding.
+        """Return ψ in the user's coordinates y = centre + scale·s, this chain being ψ⁻¹, exact to rounding.
 
         ψ⁻¹ is the cheap direction, explicit Euler: rollouts are images under ψ⁻¹, and ψ is needed only at their starts.
         """

@@ -4,27 +4,35 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, Literal, get_args
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 
 from dt_viz.errors import FormatError
 from dt_viz.files.checks import real_numbers
-from dt_viz.flows.diffeomorphisms import MOST_STEPS, Chain, Diffeomorphism, Flow, min_det_jacobian, round_trip_error
+from dt_viz.flows.diffeomorphisms import (
+    MOST_STEPS,
+    Chain,
+    Diffeomorphism,
+    Flow,
+    Placed,
+    min_det_jacobian,
+    round_trip_error,
+)
 from dt_viz.flows.fields import Array, GaussianGrid, GridRBF
 from dt_viz.flows.integrators import euler, implicit_euler
 from dt_viz.flows.systems import DiffeomorphicSystem
-from dt_viz.learning.augmented import expected_motions
 from dt_viz.learning.demonstrations import DIMENSIONS, Demonstration
-from dt_viz.learning.flow_chain import FlowLayer, Stack, equally_spaced_grid, min_step_determinant, scaled_field
-from dt_viz.learning.initial_guess import layers_along, regress, unbending
-from dt_viz.learning.preparation import ImitationError, Motions, prepare
-from dt_viz.learning.timing import TimedAttractor, learn_timing
+from dt_viz.learning.flow_chain import FlowChain, FlowLayer, equally_spaced_grid, scaled_field
+from dt_viz.learning.initial_guess import groups_of, layers_along, regress, unbending
+from dt_viz.learning.interface import AnyImitation, State
+from dt_viz.learning.preparation import ImitationError, Motions, PreparationSettings, prepare
+from dt_viz.learning.timing import TimedAttractor, TimingSettings, learn_timing
 from dt_viz.learning.trajectory import TrajectoryFit
 from dt_viz.learning.velocity import VelocityFit
-from dt_viz.metrics import interpolate, resample_by_arc_length
+from dt_viz.metrics import interpolate
 
 Progress = Callable[[float, str], None]
 
@@ -32,15 +40,7 @@ Objective = Literal["trajectory", "velocity"]
 """Objective of a fit: the rollouts themselves, or the velocities at the demonstrations' points (eq. (3))."""
 OBJECTIVES: tuple[Objective, ...] = get_args(Objective)
 
-MIN_STEP_DETERMINANT = 0.05  # smallest determinant of an Euler step's derivative; at 0 space would fold
 EVEN = 1e-9  # largest difference of successive distances between inducing points, relative to their coordinates
-STEP_LENGTH = 0.8  # longest Euler step of the initial guess, in σ
-MAX_LAYERS = 10
-MAX_ATTEMPTS = 5  # number of fits, each smoother than the one before
-EXPECTED = 0.25  # weight of all motions that are expected from starts around the demonstrated ones, against these; only
-# in the plane: in space the fit of `lift_box` loses by them
-STRAYED = 0.6  # distance of a rollout from its demonstration, in spreads, from which a warning is given
-VELOCITY_REGULARISATION = 100.0  # factor on the regularisation for the velocity objective
 NOT_INVERTIBLE = "no invertible map follows these demonstrations; do they contradict each other?"
 
 
@@ -56,8 +56,14 @@ class ImitationSettings:
     num_layers: int = 3
     """Smallest number of stationary flows that ψ is composed of; motions that turn far get more. The velocity objective
     has one flow, with the steps of all."""
+    max_layers: int = 10
+    """Largest number of them."""
     steps: int = 4
     """Number of Euler steps of each flow."""
+    step_length: float = 0.8
+    """Longest Euler step of the initial guess, in σ, from which motions get more layers."""
+    min_determinant: float = 0.05
+    """Smallest determinant of an Euler step's derivative; at 0 space would fold. The optimiser makes no step there."""
     sigma: float | None = None
     """Width of a Gaussian. None takes 1 in the plane and 0.6 in space, less for long motions in little space; half of
     that for the velocity objective."""
@@ -71,42 +77,54 @@ class ImitationSettings:
     """Distance from the data, in σ, beyond which inducing points are left out."""
     regularisation: float = 3e-5
     """Weight of the squared RKHS norm, summed over layers, against the mean squared distance."""
+    velocity_regularisation: float = 3e-3
+    """The same weight against the mean squared error of velocities in spreads a duration."""
     num_points: int = 30
     """Smallest number of points of a demonstration that are fitted; long motions get more."""
     max_iterations: int = 20
     """Largest number of Gauss–Newton iterations; L-BFGS, whose iterations are cheaper, takes up to ten times more."""
+    max_missed: float = 0.05
+    """Largest Fréchet distance of a motion from its demonstration, relative to the extent, with which the plain state
+    is taken where none is asked for."""
+    max_strayed: float = 0.6
+    """Distance of a motion from its demonstration at equal times from which a warning is given."""
+    beside: float = 0.25
+    """Weight of all motions beside the demonstrations against these, in the plane; see `motions_beside`. In space the
+    fit of `lift_box` loses by them."""
+    preparation: PreparationSettings = field(default_factory=PreparationSettings)
+    """Settings of what is done to the demonstrations before."""
+    timing: TimingSettings = field(default_factory=TimingSettings)
+    """Settings of the timing, which is learned afterwards."""
 
     def __post_init__(self) -> None:
         if self.objective not in OBJECTIVES:
             raise ImitationError(f"objective: found {self.objective!r}; accepted: {' or '.join(OBJECTIVES)}")
 
 
-@dataclass(frozen=True)
-class Imitation:
-    """A learned motion: ψ and the base attractor, in the demonstrations' own units, with certificates."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Imitation(AnyImitation):
+    """A motion learned in the plain state: ψ and the base attractor, with certificates."""
 
+    state: ClassVar[State] = "plain"
     transform: Chain
     """ψ, from the space of the demonstrations to the space of the base attractor."""
     base: TimedAttractor
     """The base system; its goal is z_e = ψ(goal)."""
-    starts: Array
-    """(R, d) starts of the demonstrations."""
-    goal: Array
-    """(d,) common end of the demonstrations."""
-    fit_seconds: float
     min_det_jacobian: float
     """Smallest det J over the demonstrations' box grown by half its size on every side."""
     round_trip_error: float
     """Largest ‖ψ⁻¹(ψ(x)) − x‖ over the same box."""
-    warnings: tuple[str, ...] = ()
 
     @cached_property
     def system(self) -> DiffeomorphicSystem:
         """The learned dynamical system."""
         return DiffeomorphicSystem(self.transform, self.base)
 
+    def system_in(self, origin: Array, axes: Array, scale: float) -> DiffeomorphicSystem:
+        base = self.base.placed(origin, axes[:, : len(self.goal)], scale)
+        return DiffeomorphicSystem(Placed(self.transform, origin, axes, scale), base)
+
     def to_arrays(self) -> dict[str, Array]:
-        """Everything as plain arrays, for a file without pickle."""
         arrays: dict[str, Any] = {
             "starts": self.starts,
             "goal": self.goal,
@@ -154,16 +172,16 @@ class Imitation:
             raise FormatError("base", "a pace, speed or width of 0 or below, or knots that do not increase", "above 0")
         seconds, min_det, error = (float(x) for x in _finite(arrays, "certificates", 3))
         return cls(
-            Chain(flows),
-            TimedAttractor(
+            transform=Chain(flows),
+            base=TimedAttractor(
                 np.array(base), float(speed), float(smoothing), directions=directions, knots=knots, paces=paces
             ),
-            _finite(arrays, "starts", None, d),
-            goal,
-            seconds,
-            min_det,
-            error,
-            tuple(str(w) for w in np.ravel(arrays.get("warnings", ()))),
+            starts=_finite(arrays, "starts", None, d),
+            goal=goal,
+            fit_seconds=seconds,
+            min_det_jacobian=min_det,
+            round_trip_error=error,
+            warnings=tuple(str(w) for w in np.ravel(arrays.get("warnings", ()))),
         )
 
 
@@ -195,27 +213,26 @@ def fit(
     progress = progress or (lambda _fraction, _message: None)
     began = time.perf_counter()
     progress(0.0, "checking the demonstrations")
-    motions = prepare(demonstrations)
+    motions = prepare(demonstrations, settings.preparation)
     fit_transform = _fit_trajectories if settings.objective == "trajectory" else _fit_velocities
-    transform, warnings = fit_transform(motions, settings, progress)
+    transform = fit_transform(motions, settings, progress)
 
     progress(0.92, "learning the timing")
-    base = learn_timing(transform, motions.goal, motions.times, motions.positions)
+    base = learn_timing(transform, motions, settings.timing)
     progress(0.96, "checking that the map is invertible")
     box = grown_grid(np.concatenate(motions.positions), 40 if transform.dim == 2 else 12)
     result = Imitation(
-        transform,
-        base,
-        np.array([path[0] for path in motions.positions]),
-        motions.goal,
+        transform=transform,
+        base=base,
+        starts=motions.starts,
+        goal=motions.goal,
         fit_seconds=time.perf_counter() - began,
         min_det_jacobian=min_det_jacobian(transform.jacobian, box),
         round_trip_error=round_trip_error(transform, box),
         warnings=(
             *motions.warnings,
             *motions.crossing,
-            *warnings,
-            *_strayed(motions, DiffeomorphicSystem(transform, base)),
+            *_strayed(motions, DiffeomorphicSystem(transform, base), settings.max_strayed),
         ),
     )
     if not (result.min_det_jacobian > 0 and result.round_trip_error < 1e-9 * motions.spread):
@@ -227,44 +244,76 @@ def fit(
     return result
 
 
-def _fit_trajectories(motions: Motions, settings: ImitationSettings, progress: Progress) -> tuple[Chain, list[str]]:
+def _fit_trajectories(motions: Motions, settings: ImitationSettings, progress: Progress) -> Chain:
     """Fit ψ by the trajectory objective, as closely as possible without folding space."""
     num_points = int(np.clip(4 * motions.length, settings.num_points, max(settings.num_points, 60)))
     points = motions.resampled(num_points)
-    expected = expected_motions(motions) if points.shape[-1] == 2 else []
-    importance = np.repeat([1.0, EXPECTED * len(points) / max(1, len(expected))], [len(points), len(expected)])
-    points = np.concatenate([points, *(resample_by_arc_length(path, num_points)[None] for path in expected)])
+    beside = motions_beside(motions, points) if settings.beside and points.shape[-1] == 2 else points[:0]
+    importance = np.repeat([1.0, settings.beside * len(points) / max(1, len(beside))], [len(points), len(beside)])
+    points = np.concatenate([points, beside])
     centre, scale = points.mean(axis=(0, 1)), motions.spread
     normalised = (points - centre) / scale
-    fractions = np.broadcast_to(np.linspace(0.0, 1.0, num_points), points.shape[:2])
-    sigma = _width(motions, settings)
+    progress(0.05, "unbending the mean demonstration")
+    chain, thetas, ends, regularisation = _initial_guess(normalised, _width(motions, settings), settings)
 
-    for attempt in range(MAX_ATTEMPTS):
-        progress(0.05, "unbending the mean demonstration")
-        regularisation, steps = settings.regularisation * 10.0**attempt, settings.steps * min(2**attempt, 4)
-        shapes = unbending(normalised, settings.num_layers - 1, STEP_LENGTH * sigma * steps, MAX_LAYERS - 1)
+    def report(iteration: int, rms: float) -> None:
+        done = 0.1 + 0.8 * iteration / settings.max_iterations
+        progress(done, f"fitting, {100 * rms:.1f} % of the spread off")
+
+    for weight in dict.fromkeys((regularisation, settings.regularisation)):  # from as smooth a fit as the guess
+        problem = TrajectoryFit(chain, normalised, importance, weight, settings.min_determinant)
+        solve = partial(problem.solve, thetas, ends, max_iterations=settings.max_iterations, report=report)
+        found = solve(refuses=False)
+        thetas, ends = solve(refuses=True) if problem.folds(found[0]) else found
+    return chain.transform(thetas, centre, scale)
+
+
+def motions_beside(motions: Motions, points: Array) -> Array:
+    """Motions from starts on both sides of the mean one, 1.2 standard deviations along each principal axis.
+
+    They are the mean motion with an offset that fades. They tell a fit that knows places alone what to do between
+    demonstrations and beside them.
+
+    Args:
+        motions: R of them, in the plane.
+        points: (R, n, 2) of these.
+    """
+    found, groups = [], groups_of((points - points.mean(axis=(0, 1))) / motions.spread)
+    for own in (points[groups == group] for group in range(groups.max() + 1)):
+        mean, starts = own.mean(axis=0), own[:, 0]
+        axes = motions.principal_axes(starts, mean[0] - motions.goal)
+        widths = np.maximum((starts @ axes).std(axis=0), 0.03 * motions.extent)
+        offsets = 1.2 * np.concatenate([(widths * axes).T, -(widths * axes).T])
+        found.append(mean + np.linspace(1.0, 0.0, len(mean))[:, None] * offsets[:, None])
+    return np.concatenate(found)
+
+
+def _initial_guess(
+    points: Array, sigma: float, settings: ImitationSettings
+) -> tuple[FlowChain, list[Array], Array, float]:
+    """The chain that is fitted to motions `points` (R, n, d), coefficients, images of the ends, and regularisation.
+
+    Where the guess folds, it gets smoother, and then more steps, too.
+    """
+    for attempt in range(6):
+        steps = settings.steps * min(2 ** max(attempt - 1, 0), 4)
+        longest = settings.step_length * sigma * steps
+        shapes = unbending(points, settings.num_layers - 1, longest, settings.max_layers - 1)
         if settings.num_inducing is None:
             layers = layers_along(shapes, sigma, spacing=settings.spacing, reach=settings.reach)
         else:
-            flat = np.concatenate(shapes).reshape(-1, normalised.shape[-1])
+            flat = np.concatenate(shapes).reshape(-1, points.shape[-1])
             layer = FlowLayer.of(equally_spaced_grid(flat, settings.num_inducing, 0.5 / sigma**2))
             layers = (layer,) * (len(shapes) - 1)
-        stack = Stack(layers, steps)
-        thetas = regress(stack, shapes, regularisation)
-
-        def report(iteration: int, rms: float) -> None:
-            done = 0.1 + 0.8 * iteration / settings.max_iterations
-            progress(done, f"fitting, {100 * rms:.1f} % of the spread off")
-
-        problem = TrajectoryFit(stack, normalised, fractions, regularisation, importance)
-        ends = np.concatenate([shapes[0][:, 0], shapes[0][:1, -1]])
-        thetas, ends, _ = problem.solve(thetas, ends, max_iterations=settings.max_iterations, report=report)
-        if stack.min_step_determinant(thetas) > MIN_STEP_DETERMINANT:
-            return stack.transform(thetas, centre, scale), _smoothed(attempt)
+        chain = FlowChain(layers, steps)
+        regularisation = settings.regularisation * 10.0**attempt
+        thetas = regress(chain, shapes, regularisation)
+        if chain.min_step_determinant(thetas) > settings.min_determinant:
+            return chain, thetas, np.concatenate([shapes[0][:, 0], shapes[0][:1, -1]]), regularisation
     raise ImitationError(NOT_INVERTIBLE)
 
 
-def _fit_velocities(motions: Motions, settings: ImitationSettings, progress: Progress) -> tuple[Chain, list[str]]:
+def _fit_velocities(motions: Motions, settings: ImitationSettings, progress: Progress) -> Chain:
     """Fit ψ by the velocity objective: one flow in explicit Euler steps, as in the paper, inverted exactly."""
     scale, duration = motions.spread, float(np.mean([t[-1] for t in motions.times]))
     centre = motions.resampled(settings.num_points).mean(axis=(0, 1))
@@ -284,22 +333,19 @@ def _fit_velocities(motions: Motions, settings: ImitationSettings, progress: Pro
     def report(iteration: int, cost: float) -> None:
         progress(0.05 + 0.85 * iteration / max_iterations, f"fitting velocities, mean square error {cost:.3g}")
 
-    for attempt in range(MAX_ATTEMPTS):
-        problem = VelocityFit(
-            grid,
-            x,
-            v,
-            (motions.goal - centre) / scale,
-            speed=motions.length,
-            smoothing=0.1 * motions.length,
-            regularisation=settings.regularisation * VELOCITY_REGULARISATION * 10.0**attempt,
-            steps=steps,
-        )
-        field = GridRBF(grid, problem.solve(max_iterations, report))
-        if min_step_determinant(field, 1.0 / steps) > MIN_STEP_DETERMINANT:
-            flow = Flow(scaled_field(field, centre, scale), 1.0, steps, euler, implicit_euler)
-            return Chain([flow]), _smoothed(attempt)
-    raise ImitationError(NOT_INVERTIBLE)
+    problem = VelocityFit(
+        grid,
+        x,
+        v,
+        (motions.goal - centre) / scale,
+        speed=motions.length,
+        smoothing=0.1 * motions.length,
+        regularisation=settings.velocity_regularisation,
+        steps=steps,
+        min_determinant=settings.min_determinant,
+    )
+    field = scaled_field(GridRBF(grid, problem.solve(max_iterations, report)), centre, scale)
+    return Chain([Flow(field, 1.0, steps, euler, implicit_euler)])
 
 
 def _width(motions: Motions, settings: ImitationSettings) -> float:
@@ -312,22 +358,13 @@ def _width(motions: Motions, settings: ImitationSettings) -> float:
     return width if settings.objective == "trajectory" else 0.5 * width
 
 
-def _smoothed(attempt: int) -> list[str]:
-    if attempt == 0:
-        return []
-    return [
-        f"the closest fit would fold the space over itself; regularised {10**attempt} times as much, it is invertible "
-        "and follows the demonstrations less closely"
-    ]
-
-
-def _strayed(motions: Motions, system: DiffeomorphicSystem) -> list[str]:
+def _strayed(motions: Motions, system: DiffeomorphicSystem, most: float) -> list[str]:
     """Return a warning for each motion that its rollout does not follow."""
     warnings = []
     for name, times, path in zip(motions.names, motions.times, motions.positions, strict=True):
         at = np.linspace(0, len(times) - 1, min(len(times), 100)).astype(int)
         off = np.linalg.norm(system.rollout(path[0], times[at]) - path[at], axis=1).max()
-        if off > STRAYED * motions.spread:
+        if off > most * motions.spread:
             warnings.append(f"the learned motion strays up to {off:.2g} from '{name}'")
     return warnings
 

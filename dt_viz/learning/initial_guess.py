@@ -23,7 +23,7 @@ from scipy.optimize import nnls
 from scipy.spatial.transform import Rotation
 
 from dt_viz.flows.fields import Array
-from dt_viz.learning.flow_chain import FlowLayer, Stack
+from dt_viz.learning.flow_chain import FlowChain, FlowLayer
 
 SMOOTHING = 0.04  # width of the filter for tangents, as a fraction of the motion; half of it to find what winds
 MAX_TURN = (
@@ -184,11 +184,11 @@ def _chain_rotations(increments: Array, kept: int, start: Rotation) -> Rotation:
     return Rotation.concatenate([frames[k] for k in range(len(increments) + 1)])
 
 
-def regress(stack: Stack, shapes: Sequence[Array], regularisation: float, iterations: int = 5) -> list[Array]:
+def regress(chain: FlowChain, shapes: Sequence[Array], regularisation: float, iterations: int = 5) -> list[Array]:
     """Fit each layer, one after the other, to carry its shape to the next one.
 
     Args:
-        stack: L layers.
+        chain: L layers.
         shapes: L + 1 arrays (R, n, d).
         regularisation: weight of the squared RKHS norm against the mean squared distance.
         iterations: number of fixed-point iterations for the path through the layer's Euler steps.
@@ -196,21 +196,21 @@ def regress(stack: Stack, shapes: Sequence[Array], regularisation: float, iterat
     Returns:
         The coefficients (m_l, d) of each layer.
     """
-    h = 1.0 / stack.steps
-    current = shapes[0].reshape(-1, stack.dim)
+    h = 1.0 / chain.steps
+    current = shapes[0].reshape(-1, chain.dim)
     thetas = []
-    for layer, shape in zip(stack.layers, shapes[1:], strict=True):
-        target = shape.reshape(-1, stack.dim)
-        theta = np.zeros((layer.num_features, stack.dim))
+    for layer, shape in zip(chain.layers, shapes[1:], strict=True):
+        target = shape.reshape(-1, chain.dim)
+        theta = np.zeros((layer.num_features, chain.dim))
         for _ in range(iterations):
             s, jacobian = current, np.zeros((len(current), layer.num_features))
-            for _ in range(stack.steps):
+            for _ in range(chain.steps):
                 features = layer.features(s)
                 jacobian += h * features
                 s = s + h * (features @ theta)
             normal = jacobian.T @ jacobian / len(s) + regularisation * np.eye(len(theta))
             theta += cho_solve(cho_factor(normal), jacobian.T @ (target - s) / len(s) - regularisation * theta)
-        for _ in range(stack.steps):
+        for _ in range(chain.steps):
             current = current + h * (layer.features(current) @ theta)
         thetas.append(theta)
     return thetas

@@ -10,20 +10,31 @@ import numpy as np
 
 from dt_viz.errors import FormatError
 from dt_viz.flows.fields import Array
+from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.demonstrations import Demonstration, samples_of
-from dt_viz.metrics import arc_length, resample_by_arc_length
+from dt_viz.metrics import arc_length, discrete_frechet, resample_by_arc_length
 
-# Lengths are in units of the spread, the RMS distance of the demonstrations' points from their mean.
-SAME_GOAL = 1e-3  # distance from the goal up to which an end is at the goal
-MAX_MOVED_END = 0.3  # distance from the goal up to which an end is moved there
-AT_GOAL = 0.05  # distance from the goal up to which a start is at the goal
-STANDING_STEP = 1e-3  # length of a step, lasting 1 % of the motion, below which the motion stands still
-DECIDING = 1e-3  # deviation that points are given along a way, to decide between axes that are alike
-LONG_STAND = 0.1  # part of the duration from which standing still is reported
+DECIDING = 1e-3  # deviation that points are given along a way, in spreads, to decide between axes that are alike
 
 
 class ImitationError(ValueError):
     """Demonstrations from which no stable system can be learned; the message names the demonstration and the reason."""
+
+
+@dataclass(frozen=True)
+class PreparationSettings:
+    """Settings of the preparation. Lengths are in spreads, the RMS distance of all points from their mean."""
+
+    same_goal: float = 1e-3
+    """Distance from the goal up to which an end is at the goal."""
+    max_moved_end: float = 0.3
+    """Distance from the goal up to which an end is moved there; farther ones are left out."""
+    at_goal: float = 0.05
+    """Distance from the goal up to which a start is at the goal."""
+    standing_step: float = 1e-3
+    """Length of a step, lasting 1 % of the motion, below which the motion stands still."""
+    long_stand: float = 0.1
+    """Part of the duration from which standing still is reported."""
 
 
 @dataclass(frozen=True)
@@ -73,17 +84,36 @@ class Motions:
         along = DECIDING * self.spread * way / max(float(np.linalg.norm(way)), 1e-12 * self.spread)
         return np.linalg.eigh(np.cov(points, rowvar=False, bias=True) + np.outer(along, along))[1]
 
-    def resampled(self, num: int) -> Array:
+    @property
+    def starts(self) -> Array:
+        """First points, (R, d)."""
+        return np.stack([path[0] for path in self.positions])
+
+    def resampled(self, num: int = 120) -> Array:
         """Resample all motions at `num` points equally spaced along each, (R, num, d)."""
         return np.stack([resample_by_arc_length(path, num) for path in self.positions])
 
+    def missed_by(self, system: DiffeomorphicSystem, states: Array) -> float:
+        """Largest discrete Fréchet distance of a system's motions from these, relative to the extent.
 
-def prepare(demonstrations: Sequence[Demonstration]) -> Motions:
-    """Check demonstrations and give them a common goal.
+        Args:
+            system: of states, the first d coordinates of which are a place.
+            states: (R, k) in which its motions begin.
+        """
+        wanted = self.resampled()
+        z = system.base.at_fraction(system.transform.forward(states), np.linspace(1.0, 0.0, wanted.shape[1]))
+        paths = system.transform.inverse(z)[..., : wanted.shape[2]]
+        found = np.stack([resample_by_arc_length(path, wanted.shape[1]) for path in paths])
+        return float(discrete_frechet(found, wanted).max()) / self.extent
+
+
+def prepare(demonstrations: Sequence[Demonstration], settings: PreparationSettings | None = None) -> Motions:
+    """Check demonstrations and give them a common goal; None takes the default settings.
 
     Raises:
         ImitationError: there are none, they are damaged, or most do not end at one place.
     """
+    settings = settings or PreparationSettings()
     try:
         samples = samples_of(demonstrations)
     except FormatError as error:
@@ -98,23 +128,24 @@ def prepare(demonstrations: Sequence[Demonstration]) -> Motions:
     if not usable:
         raise ImitationError("no demonstration moves; at least one must lead to the goal")
     spread = _spread(list(usable.values()))
-    usable, goal = _with_common_goal(usable, spread, warnings)
+    usable, goal = _with_common_goal(usable, spread, settings, warnings)
 
     numbers, names, times, positions = [], [], [], []
     for number, demonstration in usable.items():
         t, path = demonstration.times, _end_moved(demonstration.positions, goal)
-        away = np.flatnonzero(np.linalg.norm(path - goal, axis=1) > AT_GOAL * spread)
+        away = np.flatnonzero(np.linalg.norm(path - goal, axis=1) > settings.at_goal * spread)
         if len(away) == 0:
             warnings.append(f"'{demonstration.name}' stays at the goal; it is left out")
             continue
-        if np.linalg.norm(path[0] - goal) <= AT_GOAL * spread:
+        if np.linalg.norm(path[0] - goal) <= settings.at_goal * spread:
             first = away[0]
             warnings.append(
                 f"'{demonstration.name}' starts at the goal, where a stable motion ends; "
                 f"its first {t[first]:.2g} s are left out"
             )
             t, path = t[first:] - t[first], path[first:]
-        _warn_about(demonstration.name, t, path, spread, warnings)
+        if standing := _stands_still(demonstration.name, t, path, spread, settings):
+            warnings.append(standing)
         numbers.append(number)
         names.append(demonstration.name)
         times.append(t)
@@ -130,24 +161,24 @@ def _spread(demonstrations: Sequence[Demonstration]) -> float:
 
 
 def _with_common_goal(
-    demonstrations: dict[int, Demonstration], spread: float, warnings: list[str]
+    demonstrations: dict[int, Demonstration], spread: float, settings: PreparationSettings, warnings: list[str]
 ) -> tuple[dict[int, Demonstration], Array]:
     """Return the demonstrations that end where most of them do, and that goal."""
     found = list(demonstrations.values())
     ends = np.array([demonstration.positions[-1] for demonstration in found])
-    near = np.linalg.norm(ends - np.median(ends, axis=0), axis=1) <= MAX_MOVED_END * spread
+    near = np.linalg.norm(ends - np.median(ends, axis=0), axis=1) <= settings.max_moved_end * spread
     if 2 * near.sum() <= len(ends):
         farthest = found[int(np.argmax(np.linalg.norm(ends - np.median(ends, axis=0), axis=1)))]
         raise ImitationError(
-            f"the demonstrations have no common goal: most end more than {MAX_MOVED_END * spread:.2g} from where the "
-            f"others do, '{farthest.name}' the farthest"
+            f"the demonstrations have no common goal: most end more than "
+            f"{settings.max_moved_end * spread:.2g} from where the others do, '{farthest.name}' the farthest"
         )
     goal = ends[near].mean(axis=0)
     for demonstration, end, kept in zip(found, ends, near, strict=True):
         off = float(np.linalg.norm(end - goal))
         if not kept:
             warnings.append(f"'{demonstration.name}' ends {off:.2g} from the others' goal; it is left out")
-        elif off > SAME_GOAL * spread:
+        elif off > settings.same_goal * spread:
             warnings.append(f"'{demonstration.name}' ends {off:.2g} from the common goal; its end is moved there")
     return {number: d for (number, d), kept in zip(demonstrations.items(), near, strict=True) if kept}, goal
 
@@ -160,12 +191,14 @@ def _end_moved(path: Array, goal: Array) -> Array:
     return moved
 
 
-def _warn_about(name: str, t: Array, path: Array, spread: float, warnings: list[str]) -> None:
+def _stands_still(name: str, t: Array, path: Array, spread: float, settings: PreparationSettings) -> str:
+    """The warning about a motion that stands still for long; empty where it does not."""
     even = np.linspace(t[0], t[-1], 101)
     steps = np.linalg.norm(np.diff([np.interp(even, t, x) for x in path.T], axis=1), axis=0)
-    standing = float((steps[1:-1] < STANDING_STEP * spread).mean())
-    if standing > LONG_STAND:
-        warnings.append(f"'{name}' stands still for {standing * t[-1]:.2g} s; the learned motion only slows down there")
+    standing = float((steps[1:-1] < settings.standing_step * spread).mean())
+    if standing <= settings.long_stand:
+        return ""
+    return f"'{name}' stands still for {standing * t[-1]:.2g} s; the learned motion only slows down there"
 
 
 def _crosses_itself(path: Array) -> bool:

@@ -14,11 +14,12 @@ import numpy as np
 from dt_viz.files.npz import arrays_of, npz_bytes, write_whole
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.imitation import Imitation, ImitationSettings, Progress, fit
-from dt_viz.learning.state import AnyImitation, State, learn
+from dt_viz.learning.interface import AnyImitation, State
+from dt_viz.learning.state import learn
 
 logger = logging.getLogger(__name__)
 
-FORMAT = 4
+FORMAT = 5
 """Version of the fit and its file; raised with every change, so that older files are not used."""
 
 MAX_BYTES = 40 * 10**6

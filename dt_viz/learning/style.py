@@ -32,7 +32,7 @@ class Style:
             ImitationError: they do not have as many coordinates, or one shows several patterns: it has no mean motion.
         """
         _check(len(usual.goal), len(styled.goal))
-        num = max(max(len(one.patterns), len(one.known_labels)) for one in (usual, styled))
+        num = max(len(one.patterns) for one in (usual, styled))
         if num > 1:
             raise ImitationError(f"style: found a hand of {num} patterns; accepted: 1, demonstrations of one figure")
         means = [one.patterns[0].mean / one.top for one in (usual, styled)]

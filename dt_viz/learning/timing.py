@@ -6,7 +6,6 @@ has learned of the demonstrations' shape is kept, and their timing is learned af
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -18,12 +17,26 @@ from scipy.optimize import lsq_linear
 from dt_viz.flows.diffeomorphisms import Diffeomorphism
 from dt_viz.flows.fields import Array
 from dt_viz.flows.systems import Attractor, asinh_exp, log_sinh
+from dt_viz.learning.preparation import Motions
 from dt_viz.metrics import interpolate
 
 ARRIVED = 3e-4  # distance from the goal, relative to the ray's length, that counts as a demonstration's end
-MIN_PACE = 0.15  # smallest pace: a motion is at most about seven times as fast as the plain attractor
-SMOOTHNESS = 0.03  # weight of a pace's second differences against errors in time, relative to the duration
-SHARPNESS = 0.1  # width of the blend between demonstrations, relative to the distance between neighbours
+
+
+@dataclass(frozen=True)
+class TimingSettings:
+    """Settings of a learned timing."""
+
+    min_pace: float = 0.15
+    """Smallest pace: a motion is at most about seven times as fast as the plain attractor."""
+    smoothness: float = 0.03
+    """Weight of a pace's second differences against errors in time, relative to the duration."""
+    num_knots: int = 48
+    """Number of knots of each pace function."""
+    num_ray: int = 400
+    """Number of points of a rollout that a demonstration's points may be matched with."""
+    num_samples: int = 120
+    """Number of points of a demonstration that are matched, equally spaced in time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +55,8 @@ class TimedAttractor(Attractor):
     """(K,) increasing and equally spaced values of τ, seconds."""
     paces: Array
     """(R, K) m_i at the knots, positive; all equal at the first knot, nearest the goal, so that ż is smooth there."""
+    sharpness: float = 0.1
+    """Width of the blend between demonstrations, relative to the distance between neighbours."""
 
     def velocity(self, z: Array) -> Array:
         """Compute ż, (*B, d), m/s."""
@@ -110,7 +125,7 @@ class TimedAttractor(Attractor):
         """Distances (R,) from the demonstrations' directions within which their own pace holds."""
         distance = np.linalg.norm(self.directions[:, None] - self.directions, axis=-1)
         np.fill_diagonal(distance, 1.0)
-        return np.maximum(SHARPNESS * distance.min(axis=1), 1e-4)
+        return np.maximum(self.sharpness * distance.min(axis=1), 1e-4)
 
     def _time_to_go(self, clock: Array, paces: Array) -> Array:
         """Compute T(τ), (*B, N), zero at the first knot, for `clock` (*B, N) on rays with `paces` (*B, K)."""
@@ -135,27 +150,10 @@ class TimedAttractor(Attractor):
         return self.knots[index] + inside + beyond + np.minimum(togo, 0) / paces[..., :1]
 
 
-def learn_timing(
-    transform: Diffeomorphism,
-    goal: Array,
-    times: Sequence[Array],
-    positions: Sequence[Array],
-    *,
-    num_knots: int = 48,
-    num_ray: int = 400,
-    num_samples: int = 120,
-) -> TimedAttractor:
-    """Learn the attractor whose rollouts follow the demonstrations in time, as nearly as their paths allow.
-
-    Args:
-        transform: ψ, already fitted.
-        goal: (d,) common goal of the demonstrations.
-        times: for each demonstration (T_i,) seconds, increasing from 0.
-        positions: for each demonstration (T_i, d).
-        num_knots: knots of each pace function.
-        num_ray: points of a rollout that a demonstration's points may be matched with.
-        num_samples: points of a demonstration that are matched, equally spaced in time.
-    """
+def learn_timing(transform: Diffeomorphism, motions: Motions, settings: TimingSettings) -> TimedAttractor:
+    """Learn the attractor whose rollouts under ψ follow the motions in time, as nearly as their paths allow."""
+    goal, times, positions = motions.goal, motions.times, motions.positions
+    num_knots = settings.num_knots
     end, *images = transform.forward(np.stack([goal, *(path[0] for path in positions)]))
     offsets = np.stack(images) - end
     radii = np.linalg.norm(offsets, axis=1)
@@ -164,10 +162,10 @@ def learn_timing(
     plain = Attractor(end, speed=length / float(durations.mean()), smoothing=0.1 * length)
 
     # Rays, denser towards the goal, where the plain attractor's clock runs fast; their last point counts as arrived.
-    fractions = np.append(np.linspace(1.0, 0.0, num_ray)[:-1], ARRIVED)
+    fractions = np.append(np.linspace(1.0, 0.0, settings.num_ray)[:-1], ARRIVED)
     rays = end + fractions[:, None] * offsets[:, None]
     rollouts = transform.inverse(rays)
-    stamps = [np.linspace(0, t[-1], num_samples) for t in times]
+    stamps = [np.linspace(0, t[-1], settings.num_samples) for t in times]
     samples = np.stack([interpolate(at, t, path) for at, t, path in zip(stamps, times, positions, strict=True)])
     matched = _monotone_match(samples, rollouts)
     clocks = plain.smoothing / plain.speed * log_sinh(fractions * radii[:, None] / plain.smoothing)
@@ -175,7 +173,7 @@ def learn_timing(
     knots = np.linspace(nearest, farthest + 3 * (farthest - nearest) / (num_knots - 4), num_knots)
     paces = np.stack(
         [
-            _fit_pace(knots, clock[match], at, _speeds(at, sample))
+            _fit_pace(knots, clock[match], at, _speeds(at, sample), settings)
             for clock, match, at, sample in zip(clocks, matched, stamps, samples, strict=True)
         ]
     )
@@ -209,7 +207,7 @@ def _monotone_match(samples: Array, curves: Array) -> Array:
     return result
 
 
-def _fit_pace(knots: Array, clock: Array, elapsed: Array, speed: Array) -> Array:
+def _fit_pace(knots: Array, clock: Array, elapsed: Array, speed: Array, settings: TimingSettings) -> Array:
     """Fit the pace m (K,) at the knots so that ∫m dτ from each `clock` up to the first is `elapsed`.
 
     The errors are weighted by the speed: an error δ in time is an error speed·δ in space. Second differences are kept
@@ -219,10 +217,10 @@ def _fit_pace(knots: Array, clock: Array, elapsed: Array, speed: Array) -> Array
     rows = _hat_integrals((clock - knots[0]) / spacing, len(knots)) * spacing
     rows = rows[0] - rows
     weight = (speed / speed.mean() + 0.05)[:, None]
-    smooth = np.diff(np.eye(len(knots)), n=2, axis=0) * SMOOTHNESS * elapsed[-1]
+    smooth = np.diff(np.eye(len(knots)), n=2, axis=0) * settings.smoothness * elapsed[-1]
     A = np.concatenate([weight * rows, smooth])
     b = np.concatenate([weight[:, 0] * elapsed, np.zeros(len(smooth))])
-    pace = lsq_linear(A, b, bounds=(MIN_PACE, np.inf), method="bvls", tol=1e-12).x
+    pace = lsq_linear(A, b, bounds=(settings.min_pace, np.inf), method="bvls", tol=1e-12).x
     # A demonstration starts from rest. Motions that come from farther away must not be that slow all the way.
     beyond = np.clip(2 * (knots - clock[0]) / spacing - 1.5, 0, 1)
     return (1 - beyond) * pace + beyond * elapsed[-1] / (clock[0] - clock[-1])

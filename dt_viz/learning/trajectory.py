@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from dt_viz.flows.fields import Array
-from dt_viz.learning.flow_chain import Stack
+from dt_viz.learning.flow_chain import FlowChain
 
 IMAGE_PRIOR = 1e-7  # damping of the images of the rays' ends, which could otherwise drift
 
@@ -23,14 +23,14 @@ IMAGE_PRIOR = 1e-7  # damping of the images of the rays' ends, which could other
 class TrajectoryFit:
     """The least-squares problem: mean squared distance of rollouts to demonstrations + regularisation·‖θ‖²."""
 
-    stack: Stack
+    chain: FlowChain
     targets: Array
     """(R, n, d) points of the demonstrations, the last one the common goal."""
-    fractions: Array
-    """(R, n) place of each point on its ray, from 0 (start) to 1 (goal)."""
-    regularisation: float
     importance: Array
-    """(R,) weights of the demonstrations' squared distances, relative to their mean."""
+    """(R,) weights of their squared distances, relative to their mean."""
+    regularisation: float
+    min_determinant: float
+    """Smallest determinant of a step's derivative; coefficients with a smaller one are refused."""
     end_weight: float = 20.0
     """Weight of a residual at a ray's end against one between."""
     along_weight: float = 0.3
@@ -38,12 +38,17 @@ class TrajectoryFit:
 
     def weights(self) -> Array:
         """Return the matrices (R, n, d, d) that weight the residual vectors."""
-        d = self.stack.dim
+        d = self.chain.dim
         tangents = np.gradient(self.targets, axis=1)
         tangents /= np.maximum(np.linalg.norm(tangents, axis=-1, keepdims=True), 1e-12)
         weights = np.eye(d) - (1 - self.along_weight) * tangents[..., :, None] * tangents[..., None, :]
         weights[:, [0, -1]] = self.end_weight * np.eye(d)
         return np.sqrt(self.importance / self.importance.mean())[:, None, None, None] * weights
+
+    @property
+    def fractions(self) -> Array:
+        """(n,) place of each point on its ray, from 0 (start) to 1 (goal)."""
+        return np.linspace(0.0, 1.0, self.targets.shape[1])
 
     def solve(
         self,
@@ -51,69 +56,70 @@ class TrajectoryFit:
         ends: Array,
         *,
         max_iterations: int,
+        refuses: bool,
         tolerance: float = 1e-3,
         report: Callable[[int, float], None] | None = None,
-    ) -> tuple[list[Array], Array, float]:
+    ) -> tuple[list[Array], Array]:
         """Minimise from coefficients `thetas` and images `ends` (R + 1, d) of the starts and, last, the goal.
 
         Args:
-            thetas: initial coefficients, one array (m_l, d) for each layer.
+            thetas: initial coefficients, one array (m_l, d) for each layer, that fold nothing.
             ends: initial images.
+            refuses: whether a step that folds is refused, which is looked at after each; without, the result may fold.
             max_iterations: largest number of Gauss–Newton iterations.
             tolerance: relative decrease of the cost below which the iteration stops.
             report: called with the iteration and the root mean square distance; an exception that it raises ends the
                 fit.
 
         Returns:
-            The coefficients, the images, and the root mean square of the weighted distances.
+            The coefficients and the images.
         """
         damping = 1e-3
-        weights = self.weights().reshape(-1, self.stack.dim, self.stack.dim)
-        vector = np.concatenate([self.stack.join(thetas), ends.reshape(-1)])
+        weights = self.weights().reshape(-1, self.chain.dim, self.chain.dim)
+        vector = np.concatenate([self.chain.join(thetas), ends.reshape(-1)])
         cost = self._cost(vector, weights)
         for iteration in range(max_iterations):
             residual, jacobian = self._linearise(vector, weights)
             if report:
                 report(iteration, float(np.sqrt((residual**2).sum() / len(weights))))
             gradient = jacobian.T @ residual / len(weights) - self._prior(len(vector)) * vector
-            system = _DampedSystem(jacobian / np.sqrt(len(weights)), sum(self.stack.sizes))
+            system = _DampedSystem(jacobian / np.sqrt(len(weights)), sum(self.chain.sizes))
             before, accepted = cost, False
-            for _ in range(6):
+            for _ in range(12):
                 extra = damping * self.regularisation
                 step = system.solve(gradient, self.regularisation + extra, IMAGE_PRIOR + extra)
                 if step is None:
                     damping *= 8
                     continue
                 trial = self._cost(vector + step, weights)
-                if trial < cost:
+                if trial < cost and not (refuses and self.folds(self.chain.split(vector + step))):
                     vector, cost, accepted = vector + step, trial, True
                     damping = max(damping / 5, 1e-3)
                     break
                 damping *= 8
             if not accepted or before - cost < tolerance * before:
                 break
-        num_ends = len(self.targets) + 1
-        return (
-            self.stack.split(vector),
-            vector[-num_ends * self.stack.dim :].reshape(num_ends, -1),
-            float(np.sqrt(max(0.0, cost - (self._prior(len(vector)) * vector**2).sum()))),
-        )
+        return self.chain.split(vector), vector[sum(self.chain.sizes) :].reshape(ends.shape)
+
+    def folds(self, thetas: Sequence[Array]) -> bool:
+        """Whether some step of the chain with these coefficients folds space, or nearly does."""
+        return self.chain.min_step_determinant(thetas) <= self.min_determinant
 
     def _prior(self, size: int) -> Array:
         prior = np.full(size, self.regularisation)
-        prior[sum(self.stack.sizes) :] = 0.0
+        prior[sum(self.chain.sizes) :] = 0.0
         return prior
 
     def _rays(self, vector: Array) -> Array:
-        num, d = len(self.targets), self.stack.dim
+        num, d = len(self.targets), self.chain.dim
         ends = vector[-(num + 1) * d :].reshape(num + 1, d)
         goal, starts = ends[-1], ends[:-1]
-        return (goal + (1 - self.fractions[..., None]) * (starts - goal)[:, None]).reshape(-1, d)
+        return (goal + (1 - self.fractions[:, None]) * (starts - goal)[:, None]).reshape(-1, d)
 
     def _cost(self, vector: Array, weights: Array) -> float:
         with np.errstate(over="ignore", invalid="ignore"):
-            offset = self.targets.reshape(-1, self.stack.dim) - self.stack.inverse(
-                self._rays(vector), self.stack.split(vector)
+            offset = self.targets.reshape(-1, self.chain.dim) - self.chain.images(
+                self._rays(vector), self.chain.split(vector)
             )
             residual = np.matmul(weights, offset[..., None])
             cost = float((residual**2).sum() / len(weights) + (self._prior(len(vector)) * vector**2).sum())
@@ -122,15 +128,15 @@ class TrajectoryFit:
     def _linearise(self, vector: Array, weights: Array) -> tuple[Array, Array]:
         """Return the weighted residuals (N·d,) and the Jacobian of the weighted rollouts (N·d, P + (R + 1)·d)."""
         num, n, d = self.targets.shape
-        x, by_z, by_theta = self.stack.inverse_with_sensitivity(self._rays(vector), self.stack.split(vector))
+        x, by_z, by_theta = self.chain.images_with_sensitivity(self._rays(vector), self.chain.split(vector))
         residual = np.matmul(weights, (self.targets.reshape(-1, d) - x)[..., None])[..., 0]
         size = by_theta.shape[-1]
         jacobian = np.zeros((num, n, d, len(vector)))
         np.matmul(weights, by_theta, out=jacobian.reshape(-1, d, len(vector))[..., :size])
         by_ends = np.matmul(weights, by_z).reshape(num, n, d, d)
-        remaining = (1 - self.fractions)[..., None, None]
+        remaining = (1 - self.fractions)[:, None, None]
         for i in range(num):
-            jacobian[i, :, :, size + i * d : size + (i + 1) * d] = remaining[i] * by_ends[i]
+            jacobian[i, :, :, size + i * d : size + (i + 1) * d] = remaining * by_ends[i]
         jacobian[..., -d:] = (1 - remaining) * by_ends
         return residual.reshape(-1), jacobian.reshape(num * n * d, -1)
 

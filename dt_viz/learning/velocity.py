@@ -10,10 +10,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import OptimizeResult, minimize
 
 from dt_viz.flows.fields import Array, GaussianGrid, GridRBF
 from dt_viz.flows.systems import Attractor
+from dt_viz.learning.flow_chain import min_step_determinant
 
 
 @dataclass(frozen=True)
@@ -31,9 +32,11 @@ class VelocityFit:
     smoothing: float
     regularisation: float
     steps: int
+    min_determinant: float
+    """Smallest determinant of a step's derivative; W with a smaller one are refused."""
 
     def solve(self, max_iterations: int, report: Callable[[int, float], None] | None = None) -> Array:
-        """Minimise by L-BFGS from W = 0.
+        """Minimise by L-BFGS from W = 0, as long as no step folds space.
 
         Args:
             max_iterations: largest number of L-BFGS iterations.
@@ -43,22 +46,24 @@ class VelocityFit:
             W, (m, d).
         """
         shape = (self.grid.num_points, self.grid.dim)
-        iteration = 0
+        kept, iteration = np.zeros(shape), 0
 
         def function(vector: Array) -> tuple[float, Array]:
             cost, gradient = self.cost_and_gradient(vector.reshape(shape))
             return cost, gradient.reshape(-1)
 
-        def callback(intermediate_result: object) -> None:
-            nonlocal iteration
-            iteration += 1
+        def callback(intermediate_result: OptimizeResult) -> None:
+            nonlocal iteration, kept
+            weights = intermediate_result.x.reshape(shape).copy()
+            if min_step_determinant(GridRBF(self.grid, weights), 1.0 / self.steps) < self.min_determinant:
+                raise StopIteration
+            kept, iteration = weights, iteration + 1
             if report:
-                report(iteration, float(getattr(intermediate_result, "fun", np.nan)))
+                report(iteration, float(intermediate_result.fun))
 
-        start = np.zeros(shape[0] * shape[1])
         options = {"maxiter": max_iterations, "maxcor": 20}
-        found = minimize(function, start, jac=True, method="L-BFGS-B", callback=callback, options=options)
-        return found.x.reshape(shape)
+        minimize(function, kept.reshape(-1), jac=True, method="L-BFGS-B", callback=callback, options=options)
+        return kept
 
     def cost_and_gradient(self, weights: Array) -> tuple[float, Array]:
         """Compute the objective and its derivative by the weights W (m, d)."""

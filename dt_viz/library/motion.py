@@ -22,9 +22,10 @@ from dt_viz.errors import FormatError, check_between
 from dt_viz.flows.augmented_systems import frozen
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.rollouts import Rays, evenly_sampled, refined
-from dt_viz.learning.augmented import AugmentedImitation, unknown_label
+from dt_viz.learning.augmented import unknown_label
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.imitation import ImitationSettings, Objective
+from dt_viz.learning.patterns import AugmentedSettings
 from dt_viz.learning.state import State, learn
 from dt_viz.motion.certificates import Certificates, DrawnSamples, certified
 from dt_viz.motion.diagnostics import motion_warnings
@@ -153,13 +154,12 @@ class Motion:
     @property
     def state(self) -> str:
         """The state that it was learned in, plain or augmented."""
-        return "augmented" if self._augmented else "plain"
+        return self._learned.imitation.state
 
     @property
     def reason(self) -> str:
         """Why it was learned in the augmented state, if nobody asked for it."""
-        imitation = self._learned.imitation
-        return imitation.reason if isinstance(imitation, AugmentedImitation) else ""
+        return self._learned.imitation.reason
 
     @property
     def labels(self) -> tuple[float, ...]:
@@ -192,9 +192,10 @@ class Motion:
         """
         learned = self._learned
         imitation = learned.imitation
-        augmented = isinstance(imitation, AugmentedImitation)
-        labels = imitation.labels if isinstance(imitation, AugmentedImitation) else None
-        saved = SavedMotion(learned.task.demonstrations, self._layers, augmented, labels, self.reason)
+        augmented = imitation.state == "augmented"
+        saved = SavedMotion(
+            learned.task.demonstrations, self._layers, augmented, imitation.labels, self.reason, imitation.augmented
+        )
         save_motion(path, saved, imitation)
 
     @classmethod
@@ -224,10 +225,6 @@ class Motion:
     def nominal(self) -> Nominal:
         """The motion without what is stacked on it, from the demonstrations' starts."""
         return self._learned.demonstrated
-
-    @property
-    def _augmented(self) -> bool:
-        return isinstance(self._learned.imitation, AugmentedImitation)
 
     def _states(self, places: Array, label: float | None) -> Array:
         """The states (R, k) in which motions from places (R, d) begin."""
@@ -269,6 +266,8 @@ def fit(
     objective: Objective = "trajectory",
     state: State = "auto",
     labels: Sequence[float] | None = None,
+    settings: ImitationSettings | None = None,
+    augmented: AugmentedSettings | None = None,
 ) -> Motion:
     """Learn a stable motion from demonstrations, all ending at (about) the same place.
 
@@ -277,14 +276,16 @@ def fit(
         objective: what is fitted in the plain state: the motions, or their velocities as in eq. (3).
         state: "plain" is the paper's: one vector field of places, which needs no memory. "augmented" remembers its
             phase and where it began: it crosses itself, comes back, winds, and draws the figure from other starts,
-            too. "auto" is plain unless demonstrations conflict, or a fit with the default settings misses one by more
-            than 5 % of their extent.
-        labels: a number for each demonstration, usually from −1 to 1, where they differ although they begin at one
-            place; makes the state augmented. None finds them where that is so; see `Motion.labels`.
+            too. "auto" is plain unless a fit with the default settings misses a demonstration by more than 5 % of their
+            extent.
+        labels: a number for each demonstration, where they differ although they begin at one place: those with one
+            number are of one pattern; makes the state augmented. None finds them where that is so; see `Motion.labels`.
+        settings: of the plain fit, the objective included; None takes the defaults.
+        augmented: settings of the augmented state; None takes the defaults.
 
     Raises:
         ImitationError: no stable motion can be learned from them, or there is no such state.
     """
     given = tuple(demonstrations)
-    imitation = learn(given, ImitationSettings(objective), state, labels)
+    imitation = learn(given, settings or ImitationSettings(objective), state, labels, augmented=augmented)
     return Motion(Learned.of(Task(demonstrations=given), imitation, imitates=True))

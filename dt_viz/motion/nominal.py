@@ -13,8 +13,7 @@ from dt_viz.flows.diffeomorphisms import Identity
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.rollouts import Bundle, Rays, evenly_sampled
 from dt_viz.flows.systems import DiffeomorphicSystem
-from dt_viz.learning.augmented import AugmentedImitation
-from dt_viz.learning.state import AnyImitation
+from dt_viz.learning.interface import AnyImitation
 from dt_viz.memo import Memo
 from dt_viz.scenario.scenario import Start
 from dt_viz.scenario.tasks import Task
@@ -89,12 +88,12 @@ class Learned:
     @property
     def labels(self) -> tuple[float, ...]:
         """The labels that a start may have."""
-        return self.imitation.known_labels if isinstance(self.imitation, AugmentedImitation) else ()
+        return self.imitation.known_labels
 
     @property
     def demonstrated_labels(self) -> tuple[float, ...]:
         """The label of each demonstration; none where there are none."""
-        return (self.imitation.labels or ()) if isinstance(self.imitation, AugmentedImitation) else ()
+        return self.imitation.labels or ()
 
     def trajectory(self, start: Start) -> NominalTrajectory:
         """The rollout from an added start; a label that it cannot have is that of the nearest demonstrated start."""

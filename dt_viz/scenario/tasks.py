@@ -9,12 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from dt_viz.flows.diffeomorphisms import Placed
 from dt_viz.flows.fields import Array
 from dt_viz.flows.systems import DiffeomorphicSystem
-from dt_viz.learning.augmented import AugmentedImitation
 from dt_viz.learning.demonstrations import Demonstration, DemonstrationError, lasa_files, load_demonstrations
-from dt_viz.learning.state import AnyImitation
+from dt_viz.learning.interface import AnyImitation
 from dt_viz.metrics import resample_by_arc_length
 from dt_viz.scenario.objects import Ball, LiftedBox, Pot, PushedBox, TaskObject
 from dt_viz.scenario.slices import Slice
@@ -68,13 +66,7 @@ class Task:
 
     def system(self, imitation: AnyImitation) -> DiffeomorphicSystem:
         """Return the motion learned from the demonstrations, as a system in the world, metres and seconds."""
-        axes = self.axes[:, : len(imitation.goal)]
-        if isinstance(imitation, AugmentedImitation):
-            return imitation.placed(self.origin, axes, self.scale).system
-        return DiffeomorphicSystem(
-            Placed(imitation.transform, self.origin, self.axes, self.scale),
-            imitation.base.placed(self.origin, axes, self.scale),
-        )
+        return imitation.system_in(self.origin, self.axes, self.scale)
 
     @cached_property
     def paths(self) -> tuple[Array, ...]:

@@ -11,7 +11,7 @@ import numpy as np
 from dt_viz.avoidance.avoidance import Avoidance
 from dt_viz.avoidance.transform import Transform
 from dt_viz.errors import Cancelled, never
-from dt_viz.learning.augmented import AugmentedImitation
+from dt_viz.learning.augmented import AugmentedImitation, fit_augmented
 from dt_viz.learning.imitation import ImitationSettings, Progress
 from dt_viz.learning.store import FitStore
 from dt_viz.learning.style import Style
@@ -151,12 +151,16 @@ class Engine:
         imitation = self._fits.learned(task.demonstrations, ImitationSettings(scenario.objective), state, progress)
         return Learned.of(task, imitation, imitates=scenario.imitation)
 
+    @kept(NEWEST, by=lambda task: task)
+    def _augmented(self, task: str) -> AugmentedImitation:
+        """The augmented imitation of a task's demonstrations."""
+        return fit_augmented(self.task(task).demonstrations)
+
     @kept(NEWEST, by=lambda scenario: scenario.learned)
     def _styled(self, scenario: Scenario) -> Learned:
         """What is learned for a scenario in the augmented state, in its style."""
         tasks = scenario.task, *STYLES[scenario.style]
-        learned = (self._learned(Scenario(task, state="augmented"), None).imitation for task in tasks)
-        own, usual, other = (imitation for imitation in learned if isinstance(imitation, AugmentedImitation))
+        own, usual, other = (self._augmented(task) for task in tasks)
         imitation = Style.between(usual, other).on(own, scenario.style_amount)
         return Learned.of(self.task(scenario.task), imitation, imitates=True)
 

@@ -13,7 +13,6 @@ from dt_viz.avoidance.passing import Passing
 from dt_viz.baselines.base import Method
 from dt_viz.flows.diffeomorphisms import Flow
 from dt_viz.flows.fields import Array
-from dt_viz.learning.augmented import AugmentedImitation
 from dt_viz.motion.certificates import Certificates, DrawnSamples
 from dt_viz.motion.following import ArmMotion
 from dt_viz.motion.profiles import Profiles
@@ -173,13 +172,12 @@ class Frame:
     @property
     def remembers(self) -> bool:
         """Whether the imitation is augmented: it remembers its phase and where it began."""
-        return isinstance(self.motion.nominal.imitation, AugmentedImitation)
+        return self.motion.nominal.imitation.state == "augmented"
 
     @property
     def reason(self) -> str:
         """Why it is augmented, if nobody asked for that."""
-        imitation = self.motion.nominal.imitation
-        return imitation.reason if isinstance(imitation, AugmentedImitation) else ""
+        return self.motion.nominal.imitation.reason
 
     @property
     def labels(self) -> tuple[float, ...]:

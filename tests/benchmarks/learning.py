@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from dt_viz.evaluate.held_out import Learned, begun, frechet, path_from, shifted_to
+from dt_viz.evaluate.held_out import begun, frechet, path_from, shifted_to
 from dt_viz.evaluate.options import Row, ready_to_write, report, write_json
 from dt_viz.flows.fields import Array
-from dt_viz.learning.augmented import AugmentedImitation
 from dt_viz.learning.demonstrations import Demonstration, load_demonstrations
+from dt_viz.learning.interface import AnyImitation
 from dt_viz.learning.state import learn
 from dt_viz.metrics import resample_by_arc_length
 
@@ -71,7 +71,7 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def off_course(name: str, demonstrations: Sequence[Demonstration], imitation: Learned) -> OffCourse:
+def off_course(name: str, demonstrations: Sequence[Demonstration], imitation: AnyImitation) -> OffCourse:
     """Measure a motion off its demonstrations."""
     paths = [d.positions for d in demonstrations]
     extent = float(np.ptp(np.concatenate(paths), axis=0).max())
@@ -103,7 +103,7 @@ def _fastest(times: Array, path: Array) -> float:
     return float((np.linalg.norm(np.diff(path, axis=0), axis=1) / np.diff(times)).max())
 
 
-def _drawn(imitation: Learned, start: Array, extent: float, across: Array) -> float:
+def _drawn(imitation: AnyImitation, start: Array, extent: float, across: Array) -> float:
     """Share of the rest of a motion that is still drawn after pushes from it, over places and directions."""
     system, state = begun(imitation, start)
     z0, dim, shares = system.transform.forward(state), len(start), []
@@ -113,8 +113,7 @@ def _drawn(imitation: Learned, start: Array, extent: float, across: Array) -> fl
         for direction in _directions(8):
             pushed = here.copy()
             pushed[:dim] += PUSH * extent * direction @ across
-            if isinstance(imitation, AugmentedImitation):
-                pushed[dim] = imitation.caught(pushed)
+            pushed = system.base.caught(pushed, pushed[:dim])
             after = path_from(system, pushed, dim)
             near = np.linalg.norm(rest[:, None] - after, axis=2).min(axis=1) < DRAWN * extent
             shares.append(near.mean())

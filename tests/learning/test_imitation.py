@@ -12,7 +12,7 @@ from dt_viz.flows.diffeomorphisms import Flow, min_det_jacobian
 from dt_viz.flows.fields import GaussianGrid, GridRBF
 from dt_viz.flows.integrators import euler, implicit_euler
 from dt_viz.learning.demonstrations import Demonstration
-from dt_viz.learning.flow_chain import FlowLayer, Stack, equally_spaced_grid, min_step_determinant
+from dt_viz.learning.flow_chain import FlowChain, FlowLayer, equally_spaced_grid, min_step_determinant
 from dt_viz.learning.imitation import Imitation, ImitationSettings, fit
 from dt_viz.learning.initial_guess import unbending
 from dt_viz.learning.preparation import ImitationError
@@ -139,17 +139,17 @@ def test_the_fitted_chain_is_the_transform_and_sensitivities_are_the_derivatives
     rng = np.random.default_rng(0)
     points = rng.normal(size=(40, dim))
     layer = FlowLayer.near(points, 1.0, spacing=1.0, reach=1.0)
-    stack = Stack((layer, layer), steps=3)
+    chain = FlowChain((layer, layer), steps=3)
     thetas = [0.3 * rng.normal(size=(layer.num_features, dim)) for _ in range(2)]
-    x, by_z, by_theta = stack.inverse_with_sensitivity(points, thetas)
-    np.testing.assert_allclose(x, stack.inverse(points, thetas), atol=1e-14)
+    x, by_z, by_theta = chain.images_with_sensitivity(points, thetas)
+    np.testing.assert_allclose(x, chain.images(points, thetas), atol=1e-14)
     direction, shift, h = rng.normal(size=by_theta.shape[-1]), rng.normal(size=points.shape), 1e-6
-    vector = stack.join(thetas)
-    ahead, back = (stack.inverse(points + t * shift, stack.split(vector + t * direction)) for t in (h, -h))
+    vector = chain.join(thetas)
+    ahead, back = (chain.images(points + t * shift, chain.split(vector + t * direction)) for t in (h, -h))
     slope = by_theta @ direction + (by_z @ shift[..., None])[..., 0]
     np.testing.assert_allclose(slope, (ahead - back) / (2 * h), atol=1e-7)
     centre, scale = np.arange(3.0, 3.0 + dim), 0.05
-    transform = stack.transform(thetas, centre, scale)
+    transform = chain.transform(thetas, centre, scale)
     np.testing.assert_allclose(transform.inverse(centre + scale * points), centre + scale * x, atol=1e-14)
 
 
@@ -168,7 +168,7 @@ def test_velocity_objective_has_its_exact_gradient(dim):
     rng = np.random.default_rng(0)
     grid = GaussianGrid.covering(rng.normal(size=(50, dim)), 0.8)
     x, v = rng.normal(size=(2, 20, dim))
-    problem = VelocityFit(grid, x, v, np.zeros(dim), 1.0, 0.3, 1e-3, 5)
+    problem = VelocityFit(grid, x, v, np.zeros(dim), 1.0, 0.3, 1e-3, 5, 0.05)
     weights, direction = 0.3 * rng.normal(size=(2, grid.num_points, dim))
     ahead, back = (problem.cost_and_gradient(weights + h * direction)[0] for h in (1e-6, -1e-6))
     slope = (problem.cost_and_gradient(weights)[1] * direction).sum()

@@ -11,8 +11,8 @@ from scenes import kinds
 
 from dt_viz.avoidance.hand import Avoidance
 from dt_viz.flows.augmented_systems import Shear
-from dt_viz.learning import augmented
 from dt_viz.learning.augmented import fit_augmented
+from dt_viz.learning.patterns import AugmentedSettings
 from dt_viz.learning.preparation import ImitationError
 from dt_viz.learning.style import Style
 from dt_viz.obstacles.shapes import Sphere, as_point
@@ -56,9 +56,9 @@ def test_it_is_the_composition_of_the_two_shears(style):
         moved = replace(imitation, patterns=(pattern,))
         at_one.append(moved.placed(-imitation.goal / imitation.top, np.eye(2), 1 / imitation.top))
     phases = np.linspace(0.02, 0.98, 20)
-    condition = np.zeros(2)
-    own = [imitation.patterns[0].shapes.at(condition) for imitation in at_one]  # what the starts add, which is no style
-    states = np.column_stack([np.random.default_rng(0).normal(size=(20, 2)), phases, np.zeros((20, 2))])
+    start = np.zeros(2)
+    own = [imitation.patterns[0].shapes.at(start) for imitation in at_one]  # what the starts add, which is no style
+    states = np.column_stack([np.random.default_rng(0).normal(size=(20, 2)), phases, np.zeros((20, 3))])
     one, other = (Shear(imitation) for imitation in at_one)
     moved = other.inverse(one.forward(states))[:, :2] - states[:, :2]
     knots = np.linspace(1, 0, len(style.offsets))
@@ -82,10 +82,9 @@ def test_taken_off_again_nothing_is_left_and_ends_stay(style, task):
     np.testing.assert_allclose(np.linalg.det(on.system.transform.jacobian(states)[1]), 1.0, atol=1e-9)
 
 
-def test_hands_of_other_detail_give_a_style_too(style, monkeypatch):
+def test_hands_of_other_detail_give_a_style_too(style):
     usual = learned("draw_s")
-    monkeypatch.setattr(augmented, "FEWEST_KNOTS", 60)
-    finer = fit_augmented(TASKS[STYLES["wavy"][1]]().demonstrations)
+    finer = fit_augmented(TASKS[STYLES["wavy"][1]]().demonstrations, settings=AugmentedSettings(min_knots=60))
     mixed, own = Style.between(usual, finer), learned("draw_c")
     assert len(mixed.offsets) == 60 and len(style.offsets) == 30
     for on in (style, mixed):

@@ -241,8 +241,8 @@ def add_transform_settings(gui: viser.GuiApi, bindings: Bindings, order: float) 
     bindings.field(objective, "objective")
     hint = (
         "plain: the paper's, one field that needs no memory. augmented: remembers its phase and where it began, so "
-        "that it crosses itself, comes back, and draws the figure from other starts. auto: plain, unless the "
-        "demonstrations conflict or are missed by it"
+        "that it crosses itself, comes back, and draws the figure from other starts. auto: plain, unless it "
+        "misses a demonstration"
     )
     state = gui.add_dropdown("State", STATES, order=order, hint=hint)
     bindings.field(state, "state")

@@ -1,0 +1,56 @@
+"""What every learned motion is, in whichever state it was learned."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import ClassVar, Literal, get_args
+
+from dt_viz.flows.fields import Array
+from dt_viz.flows.systems import DiffeomorphicSystem
+from dt_viz.learning.patterns import AugmentedSettings
+
+State = Literal["auto", "plain", "augmented"]
+"""State that a motion is learned in."""
+STATES: tuple[State, ...] = get_args(State)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class AnyImitation(ABC):
+    """A learned motion, in the demonstrations' own units."""
+
+    state: ClassVar[State]
+    """State that it was learned in."""
+    known_labels: ClassVar[tuple[float, ...]] = ()
+    """Different labels, increasing, that a motion may have; none where starts tell what follows."""
+    starts: Array
+    """(R, d) starts of the demonstrations, metres."""
+    goal: Array
+    """(d,) common end of the demonstrations, metres."""
+    fit_seconds: float
+    warnings: tuple[str, ...] = ()
+    reason: str = ""
+    """Why it was learned in this state, where that was not asked for; see `dt_viz.learning.state`."""
+    labels: tuple[float, ...] | None = None
+    """Label of each demonstration that was given; None without labels."""
+    augmented: AugmentedSettings = field(default_factory=AugmentedSettings)
+    """Settings of the augmented state."""
+
+    @property
+    @abstractmethod
+    def system(self) -> DiffeomorphicSystem:
+        """The learned dynamical system, of its states."""
+
+    @abstractmethod
+    def system_in(self, origin: Array, axes: Array, scale: float) -> DiffeomorphicSystem:
+        """The system in a space of more dimensions, where a place y becomes origin + scale·axes·y.
+
+        Args:
+            origin: (D,), metres.
+            axes: (D, D) orthonormal columns; y has the first d coordinates.
+            scale: metres for one unit of y.
+        """
+
+    def to_arrays(self) -> dict[str, Array]:
+        """What is kept in a file, as plain arrays; none of a motion that is learned again when the file is read."""
+        return {}

@@ -1,0 +1,279 @@
+"""Patterns of demonstrations: for each shape the motion and the clock of any start.
+
+The motion that a pattern predicts for a start is
+
+    c(u s_max) = mean(u) + u (start − mean(1)) + GP(start)(u),
+
+its mean demonstration, an offset that fades, and a Gaussian process over the starts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from dt_viz.flows.augmented_systems import PhaseCurve
+from dt_viz.flows.fields import Array, Indices
+from dt_viz.learning.initial_guess import groups_of
+from dt_viz.learning.preparation import Motions, PreparationSettings
+from dt_viz.metrics import arc_length, interpolate
+
+
+@dataclass(frozen=True)
+class AugmentedSettings:
+    """Settings of the augmented state. Lengths are relative to the extent of the demonstrations, or in spreads.
+
+    A spread is the RMS distance of the starts from their mean.
+    """
+
+    phase_length: float = 0.5
+    """s_max: what the phase counts beside a distance of places."""
+    power: float = 3.0
+    """p of the base system: with a large one, what leads off the motion fades early."""
+    min_knots: int = 30
+    """Smallest number of knots of a predicted motion."""
+    max_knots: int = 240
+    """Largest number of knots."""
+    knot_error: float = 0.003
+    """Mean distance of a demonstration from the curve through its knots up to which these are enough; handwriting stays
+    below 0.1 % with 30."""
+    min_spread: float = 0.04
+    """Smallest spread that is reckoned with: starts nearer to each other teach nothing of what they do."""
+    width: float = 2.0
+    """Width of the kernel over the starts, in spreads."""
+    noise: float = 0.6
+    """Variance of shapes that the starts do not explain, relative to what they do."""
+    time_noise: float = 1.0
+    """Variance of clocks that the starts do not explain, relative to what they do."""
+    time_width: float = 0.1
+    """Width of a kernel of that variance, in spreads, so that a demonstration's own start has its own timing."""
+    time_jitter: float = 0.02
+    """Part of that variance that remains noise."""
+    num_paces: int = 80
+    """Number of knots of a clock."""
+    num_timed: int = 120
+    """Number of samples of a demonstration that its clock is learned from."""
+    min_pace: float = 2e-3
+    """Smallest speed of the phase, relative to its mean: it never stands still."""
+    min_length: float = 0.1
+    """Least length of a motion that its clock is predicted for, relative to that of the mean: from the goal to the goal
+    a motion still takes some time."""
+    caught_within: float = 0.15
+    """Largest change of the phase of a motion that is pushed, relative to s_max."""
+    caught_above: float = 0.05
+    """Least phase that such a motion gets, relative to s_max."""
+    max_patterns: int = 8
+    """Largest number of patterns that are looked for."""
+    max_missed: float = 0.12
+    """Largest Fréchet distance of a motion from its demonstration; with a larger one, more patterns are looked for.
+    Handwriting of one pattern stays below 9 %."""
+    min_apart: float = 0.01
+    """Least distance of the starts of different patterns that tells these apart; nearer to each other, what is followed
+    would hang on how a start is rounded, so that labels tell them."""
+    preparation: PreparationSettings = field(default_factory=PreparationSettings)
+    """Settings of what is done to the demonstrations before."""
+
+
+@dataclass(frozen=True, eq=False)
+class StartProcess:
+    """A Gaussian process over starts: the mean of what it was given, and how it changes with the start."""
+
+    mean: Array
+    """(d,) mean of the starts."""
+    spread: float
+    """RMS distance of the starts from their mean, or a larger one."""
+    known: Array
+    """(R, d) starts, less their mean, in spreads."""
+    coefficients: Array
+    """(R, …)."""
+    width: float
+    """Width of the kernel, in spreads."""
+    noise: float
+    """Variance of what it does not explain."""
+    narrow: float | None
+    """Width of the kernel of that noise, in spreads; None for noise of each start by itself."""
+
+    @classmethod
+    def of(
+        cls,
+        starts: Array,
+        values: Array,
+        spread: float,
+        width: float,
+        noise: float,
+        narrow: float | None = None,
+        jitter: float = 1.0,
+    ) -> StartProcess:
+        """Learn `values` (R, …) of `starts` (R, d); `jitter` is the part of the noise of each start by itself."""
+        mean = starts.mean(axis=0)
+        made = cls(mean, spread, (starts - mean) / spread, np.empty(0), width, noise, narrow)
+        kernel = made._kernel(made.known) + jitter * noise * np.eye(len(starts))
+        flat = np.linalg.solve(kernel, values.reshape(len(starts), -1))
+        return replace(made, coefficients=flat.reshape(values.shape))
+
+    def at(self, start: Array) -> Array:
+        """The value at a start (d,)."""
+        return np.tensordot(self._kernel((start - self.mean)[None] / self.spread)[0], self.coefficients, 1)
+
+    def slope_at(self, start: Array) -> Array:
+        """The derivative (…, d) of the value with respect to the start (d,); of values without a narrow kernel."""
+        offset = (start - self.mean) / self.spread - self.known
+        weights = -self._kernel((start - self.mean)[None] / self.spread)[0][:, None] * offset
+        return np.moveaxis(np.tensordot(weights, self.coefficients, (0, 0)), 0, -1) / (self.width**2 * self.spread)
+
+    def placed(self, origin: Array, axes: Array, scale: float, vectors: Array) -> StartProcess:
+        """The same in a space of more dimensions, values multiplied by `vectors` (d, D) from the right.
+
+        See `dt_viz.learning.augmented.AugmentedImitation.placed` for the other arguments.
+        """
+        return replace(
+            self,
+            mean=origin + scale * axes @ self.mean,
+            spread=scale * self.spread,
+            known=self.known @ axes.T,
+            coefficients=self.coefficients @ vectors,
+        )
+
+    def _kernel(self, at: Array) -> Array:
+        """What is alike of starts `at` (N, d) and the known ones, (N, R)."""
+        squared = ((at[:, None] - self.known) ** 2).sum(axis=-1)
+        alike = np.exp(-squared / (2 * self.width**2))
+        return alike + self.noise * np.exp(-squared / (2 * self.narrow**2)) if self.narrow else alike
+
+
+@dataclass(frozen=True, eq=False)
+class Pattern:
+    """What demonstrations of one shape teach: the motion and the clock of any start."""
+
+    label: float | None
+    """Label of the demonstrations; None where their starts tell them from others."""
+    mean: Array
+    """(K, d) mean demonstration at the knots, from the start, metres."""
+    shapes: StartProcess
+    """(K, d) offsets from the mean and its fading shift."""
+    profile: Array
+    """(P,) mean part of the length that lies behind at even times."""
+    duration: float
+    """Mean logarithm of the duration of motions a metre long, seconds."""
+    timing: StartProcess
+    """(1 + P,) offsets from that logarithm, and from the profile."""
+
+    @property
+    def fading(self) -> Array:
+        """(K,) part of the phase that is left at the knots."""
+        return np.linspace(1.0, 0.0, len(self.mean))
+
+    def points(self, start: Array) -> Array:
+        """The predicted motion from a start (d,) at the knots, (K, d), metres."""
+        return self.mean + self.fading[:, None] * (start - self.mean[0]) + self.shapes.at(start)
+
+    def slopes(self, start: Array) -> Array:
+        """The derivative (K, d, d) of these points with respect to the start (d,)."""
+        return self.shapes.slope_at(start) + self.fading[:, None, None] * np.eye(len(start))
+
+    def placed(self, origin: Array, axes: Array, scale: float) -> Pattern:
+        """The same in a space of more dimensions; see `dt_viz.learning.augmented.AugmentedImitation.placed`."""
+        return replace(
+            self,
+            mean=origin + scale * self.mean @ axes.T,
+            shapes=self.shapes.placed(origin, axes, scale, scale * axes.T),
+            duration=self.duration - np.log(scale) / 2,
+            timing=self.timing.placed(origin, axes, scale, np.eye(len(self.profile) + 1)),
+        )
+
+
+def learn_patterns(
+    motions: Motions, of: Indices, labels: Sequence[float] | None, settings: AugmentedSettings
+) -> tuple[Pattern, ...]:
+    """Learn the patterns of motions.
+
+    Args:
+        motions: R of them.
+        of: (R,) index of the pattern of each.
+        labels: label of each pattern; None without labels.
+        settings: settings of the augmented state.
+    """
+    starts, points = motions.starts, _at_knots(motions, settings)
+    scatter = float(np.sqrt(((starts - starts.mean(axis=0)) ** 2).sum(axis=1).mean()))
+    spread = max(scatter, settings.min_spread * motions.extent)
+    profiles = np.stack(
+        [_profile(*each, settings.num_timed) for each in zip(motions.times, motions.positions, strict=True)]
+    )
+    paces = [np.log(t[-1] / np.sqrt(arc_length(path)[-1])) for t, path in zip(motions.times, points, strict=True)]
+    timing = np.column_stack([paces, profiles])
+    patterns = []
+    for index in range(int(of.max()) + 1):
+        own, mean = of == index, points[of == index].mean(axis=0)
+        fading = np.linspace(1.0, 0.0, len(mean))[:, None]
+        shapes = points[own] - mean - fading * (points[own, :1] - mean[0])
+        usual = timing[own].mean(axis=0)
+        patterns.append(
+            Pattern(
+                None if labels is None else labels[index],
+                mean,
+                StartProcess.of(starts[own], shapes, spread, settings.width, settings.noise),
+                usual[1:],
+                float(usual[0]),
+                StartProcess.of(
+                    starts[own],
+                    timing[own] - usual,
+                    spread,
+                    settings.width,
+                    settings.time_noise,
+                    settings.time_width,
+                    settings.time_jitter,
+                ),
+            )
+        )
+    return tuple(patterns)
+
+
+def patterns_of(points: Array, num: int) -> Indices:
+    """Tell motions apart by their shapes, wherever they begin.
+
+    Args:
+        points: (R, n, d) of them, evenly along each.
+        num: largest number of patterns.
+
+    Returns:
+        (R,) index of the pattern of each, in the order in which patterns come first.
+    """
+    groups = groups_of(points - np.linspace(1.0, 0.0, points.shape[1])[:, None] * points[:, :1], num)
+    first = list(dict.fromkeys(groups))
+    return np.array([first.index(group) for group in groups])
+
+
+def told_by_starts(starts: Array, of: Indices, least: float) -> bool:
+    """Whether motions from `starts` (R, d) begin nearest to one of their own pattern, if it has several.
+
+    Args:
+        starts: metres.
+        of: (R,) index of the pattern of each.
+        least: least distance of starts of different patterns, metres.
+    """
+    apart = np.linalg.norm(starts[:, None] - starts, axis=-1) + np.diag(np.full(len(starts), np.inf))
+    several = np.bincount(of)[of] > 1
+    own = (of[apart.argmin(axis=1)] == of)[several]
+    return bool(own.all() and apart[of[:, None] != of].min(initial=np.inf) >= least)
+
+
+def _at_knots(motions: Motions, settings: AugmentedSettings) -> Array:
+    """Demonstrations at as few knots as they are followed by, (R, K, d)."""
+    num = settings.min_knots
+    while True:
+        points = motions.resampled(5 * num)
+        even, knots = np.linspace(0.0, 1.0, points.shape[1]), np.linspace(0.0, 1.0, num)
+        at_knots = np.stack([interpolate(knots, even, path) for path in points])
+        between = PhaseCurve.through(knots, at_knots.swapaxes(0, 1)).at(even).swapaxes(0, 1)
+        missed = np.linalg.norm(between - points, axis=-1).mean(axis=1).max()
+        if missed <= settings.knot_error * motions.extent or 2 * num > settings.max_knots:
+            return at_knots
+        num *= 2
+
+
+def _profile(times: Array, path: Array, num: int) -> Array:
+    """The part of a motion's length that lies behind at `num` even times."""
+    length = arc_length(path)
+    return np.interp(np.linspace(0, times[-1], num), times, length / length[-1])
