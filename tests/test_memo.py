@@ -11,7 +11,7 @@ from dt_viz.memo import Memo
 from dt_viz.motion import following
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.engine import Engine
-from dt_viz.session.session import Session
+from dt_viz.session.session import LANE, Session
 
 
 def test_a_result_is_computed_once_kinds_do_not_mix_and_the_results_that_were_used_last_stay():
@@ -76,7 +76,7 @@ def test_one_thread_alone_computes_for_a_session(new_engine, initial, monkeypatc
     users, compute = set(), Memo.__call__
 
     def recorded(self, *args, **kwargs):
-        users.add(threading.get_ident())
+        users.add(threading.current_thread().name)
         return compute(self, *args, **kwargs)
 
     monkeypatch.setattr(Memo, "__call__", recorded)
@@ -106,4 +106,4 @@ def test_one_thread_alone_computes_for_a_session(new_engine, initial, monkeypatc
         assert session.wait_idle(60)
     finally:
         session.close()
-    assert len(users) == 1 and threading.get_ident() not in users
+    assert users == {LANE}

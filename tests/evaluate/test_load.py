@@ -22,9 +22,7 @@ PATIENCE = 240.0
 
 @pytest.fixture(autouse=True)
 def patient(monkeypatch):
-    monkeypatch.setattr(load, "FIRST_PICTURE", PATIENCE)
-    monkeypatch.setattr(load, "SETTINGS", load.LoadSettings(patience=PATIENCE))
-    monkeypatch.setattr(load, "SETTLED", 0.0)
+    monkeypatch.setattr(load, "SETTINGS", load.LoadSettings(first_picture=PATIENCE, settled=0.0, patience=PATIENCE))
 
 
 @pytest.fixture(scope="module")
@@ -123,7 +121,7 @@ def test_who_gives_way_is_chosen_and_visitors_of_a_started_server_who_look_on_co
 
 
 def test_who_gets_no_picture_in_time_fails_the_measurement(monkeypatch, capsys, url):
-    monkeypatch.setattr(load, "FIRST_PICTURE", 0.0)
+    monkeypatch.setattr(load, "SETTINGS", load.LoadSettings(first_picture=0.0, settled=0.0))
     assert main(["load", "--clients", "1", "--seconds", "1", "--url", url]) == 1
 
 

@@ -67,7 +67,9 @@ def test_cells_are_those_of_the_arrays_beside_them(folder, table, method):
         assert cells[column]["mean"] == pytest.approx(np.mean(values), abs=1e-3)
         worst = min(values) if column == "clearance" else max(values)
         assert cells[column]["worst"] == pytest.approx(worst, abs=1e-3)
-    reached = [np.linalg.norm(arrays[f"ends_{k}"] - arrays["goal"], axis=1) <= table1.REACHED for k in range(2)]
+    reached = [
+        np.linalg.norm(arrays[f"ends_{k}"] - arrays["goal"], axis=1) <= table1.SETTINGS.reached for k in range(2)
+    ]
     assert sum(map(len, reached)) == 3
     assert cells["reached"]["mean"] == np.mean([np.mean(share) for share in reached])
     assert set(cells) == set(table1.COLUMNS)
@@ -135,7 +137,7 @@ def test_motions_that_end_beside_the_goal_have_not_reached_it(problem):
 
 
 def test_too_many_places_are_refused(problem, monkeypatch):
-    monkeypatch.setattr(table1, "MAX_DRAWN", 3)
+    monkeypatch.setattr(table1, "SETTINGS", table1.Table1Settings(max_drawn=3))
     with pytest.raises(InputError, match="among 3 spheres"):
         table1.drawn(problem, 4, 0, seed=3)
 

@@ -34,6 +34,14 @@ def aside(path):
     return distance_from_path(path, path[[0, -1]])
 
 
+def turned(segments, axes):
+    """How far segments (K, 2, 3) of lines along two axes (3, 2) are turned away from these at most, rad."""
+    along = np.diff(segments, axis=1)[:, 0]
+    length = np.linalg.norm(along, axis=1)
+    cosine = np.abs(along[length > 1e-6] @ axes).max(axis=1) / length[length > 1e-6]
+    return np.arccos(np.minimum(cosine, 1)).max()
+
+
 CASES = [("draw_s", "task", 0.15), ("lift_box", "task", 0.0), ("push_box", "cspace", 0.5)]
 
 
@@ -65,8 +73,9 @@ def test_motions_begin_and_end_where_they_should_and_certificates_hold_at_every_
 def test_without_any_warp_motions_are_straight_and_so_is_space(engine, task):
     frame = frame_at(engine, stacked(engine, task, warp=0.0, view=View(grid=True)), Stage.FINE)
     grid, field = frame.pictures.grid, frame.pictures.field
-    assert grid is not None and len(grid.lines) > 10
-    assert max(aside(line).max() for line in (*frame.rollouts, *grid.lines)) < 1e-9
+    assert grid is not None and len(grid) > 10
+    assert max(aside(path).max() for path in frame.rollouts) < 1e-9
+    assert turned(grid, frame.slice.axes) < 1e-3
     to_goal = frame.goal - field.points
     cosine = (to_goal * field.velocities).sum(axis=1)
     cosine /= np.linalg.norm(to_goal, axis=1) * np.linalg.norm(field.velocities, axis=1)
@@ -77,9 +86,7 @@ def test_motions_bend_more_and_more_and_the_grid_with_them(engine):
     bends = []
     for warp in (*WARPS, 1.0):
         frame = frame_at(engine, replace(stacked(engine, "draw_s"), warp=warp, view=View(grid=True)), Stage.LIVE)
-        bends.append(
-            [max(aside(path).max() for path in lines) for lines in (frame.rollouts, frame.pictures.grid.lines)]
-        )
+        bends.append([max(aside(path).max() for path in frame.rollouts), turned(frame.pictures.grid, frame.slice.axes)])
     rollouts, lines = np.transpose(bends)
     assert (np.diff(rollouts) > 0).all()
     assert (np.diff(lines[:-1]) > 0).all()  # at last they leave the picture, and are cut shorter

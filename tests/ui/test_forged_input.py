@@ -13,6 +13,7 @@ import viser  # noqa: TID251 - forges what a browser sends
 from pages import CLIENT, MIDDLE, Page
 from viser import _messages as messages  # noqa: TID251
 
+from dt_viz.avoidance.detour import DetourSettings
 from dt_viz.scenario.paper_scenes import offered
 from dt_viz.scenario.scenario import View
 from dt_viz.scenario.tasks import TASKS
@@ -46,7 +47,9 @@ def _at_rest(page):
 
 
 def values_of(value: Any):
-    """All plain values in a scenario, but for what obstacles keep of files."""
+    """All plain values in a scenario, but for what obstacles keep of files and what the page does not offer."""
+    if isinstance(value, DetourSettings):
+        return
     if dataclasses.is_dataclass(value):
         for field in dataclasses.fields(value):
             yield from values_of(getattr(value, field.name))
