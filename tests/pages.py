@@ -40,7 +40,7 @@ PATIENCE = 30.0
 """Seconds after which a test gives up; nothing on a page takes that long."""
 
 
-def ignored(*_what: Any) -> None:
+def ignored(*_what: Any) -> Any:
     """What is told of a thing that is clicked or dragged where nobody wants to know."""
 
 
@@ -116,7 +116,7 @@ class CameraClient:
         asyncio.run(self._reported(self.camera))
 
 
-def camera_for(task: Any, camera: Any, view: str = HOME, hand: Any = None, **framing: Any) -> Any:
+def camera_for(task: Any, camera: Any, view: str = HOME, hand: Any = None, **framing: Any) -> tuple[Any, Any]:
     """Position and look-at of a view of a task in the window of a camera."""
     return view_of(task, Framing(window_size(camera), **framing), view, hand=hand)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -214,7 +214,7 @@ class Transform(ABC):
         """Whether it changes the end effector's motion; if not it is left out of the stack."""
         return True
 
-    @property
+    @cached_property
     def avoided(self) -> Union:
         """The obstacles that it leads motions around."""
         return Union()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import ClassVar, Literal, get_args
 
 from dt_viz.flows.fields import Array
@@ -21,8 +22,6 @@ class AnyImitation(ABC):
 
     state: ClassVar[State]
     """State that it was learned in."""
-    known_labels: ClassVar[tuple[float, ...]] = ()
-    """Different labels, increasing, that a motion may have; none where starts tell what follows."""
     starts: Array
     """(R, d) starts of the demonstrations, metres."""
     goal: Array
@@ -37,6 +36,11 @@ class AnyImitation(ABC):
     """Settings of the augmented state."""
 
     @property
+    def known_labels(self) -> tuple[float, ...]:
+        """Different labels, increasing, that a motion may have; none where starts tell what follows."""
+        return ()
+
+    @cached_property
     @abstractmethod
     def system(self) -> DiffeomorphicSystem:
         """The learned dynamical system, of its states."""

@@ -270,7 +270,7 @@ class _FromShape(_OfLinks):
         distance = self._obstacle.signed_distance(groups.centres @ turn.T + origin)
         # others have no point that is as deep as all of some group
         (near,) = np.nonzero(distance - groups.radii < min(0.0, float((distance + groups.radii).min())))
-        points = np.concatenate([groups.points[:1], *(groups.of_group(group) for group in near)])
+        points = np.concatenate([groups.points[:1], *(groups.of_group(int(group)) for group in near)])
         return min(0.0, float(self._obstacle.signed_distance(points @ turn.T + origin).min()))
 
 

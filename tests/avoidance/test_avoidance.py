@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scenes import avoiding
 
 from dt_viz.avoidance.clearing import clearing_duration
-from dt_viz.avoidance.hand import ACCEPTED_MARGIN, MAX_DURATION, SNAPSHOT, Avoidance, _crests
+from dt_viz.avoidance.hand import ACCEPTED_MARGIN, MAX_DURATION, SNAPSHOT, HandAvoidance, _crests
 from dt_viz.avoidance.transform import MotionBelow
 from dt_viz.flows.integrators import integrate_adaptive
 from dt_viz.obstacles.shapes import Sphere, as_point
@@ -18,7 +18,7 @@ from dt_viz.warning import Kind, MotionWarning
 seeds = st.integers(0, 2**32 - 1)
 SPHERE = Sphere((0.1, -0.4, 0.3), 0.15)
 MARGIN = 0.01
-AVOIDANCE = Avoidance(SPHERE, margin=MARGIN)
+AVOIDANCE = HandAvoidance(SPHERE, margin=MARGIN)
 
 
 def passing_points(seed, num=40, sphere=SPHERE):

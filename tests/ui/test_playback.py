@@ -83,6 +83,7 @@ def test_both_arms_are_shown_at_the_same_moment(moment):
     replay.motion = motion
     replay.advance(moment)
     for got, path in ((replay.q, motion.q), (replay.undisturbed, motion.without)):
+        assert got is not None
         np.testing.assert_allclose(got, [np.interp(moment, times, angle) for angle in path.T], atol=1e-12)
 
 
