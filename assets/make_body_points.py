@@ -15,10 +15,10 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from dt_viz.obstacles.triangles import grid_nodes, inside_of_grid, surface_samples
+from dt_viz.robot.body_points import PROTRUSION
 from dt_viz.robot.robot import LinkMesh, collision_meshes
 
 FILE = Path(__file__).parent / "body_points.npz"
-PROTRUSION = 5e-3  # metres, at most, of the spheres that cover the links
 SPACING = 1.5e-3  # metres, of points on the surface
 INNER_SPACING = 4e-3  # metres, of the candidates
 MAX_RADIUS = 0.058  # metres, of a body point: the upper links are 0.041 thick
