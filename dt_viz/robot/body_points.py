@@ -21,15 +21,15 @@ from dt_viz.shipped import ASSETS
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-PROTRUSION = 7e-3
-"""Largest distance by which the spheres that cover the links stick out of these, metres; 4 mm on average."""
+PROTRUSION = 5e-3
+"""Largest distance by which the spheres that cover the links stick out of these, metres; 3 mm on average."""
 
 
 @dataclass(frozen=True, eq=False)
 class BodyPoints:
     """Points that move with the links, and spheres around them that hold all of the arm.
 
-    In each of these spheres smaller ones cover the collision meshes and stick out by `PROTRUSION` at most, 4 mm on
+    In each of these spheres smaller ones cover the collision meshes and stick out by `PROTRUSION` at most, 3 mm on
     average: what is measured from obstacles are these.
     """
 
