@@ -458,17 +458,18 @@ class _Solver:
     def _with_duration(self, duration: float) -> ArmSolution:
         transform = self._transform(duration)
         bundle = self._sampled(transform)
-        if self._generator is None or self._avoidance.duration is not None:
-            return self._along(bundle, transform, duration)
-        for _ in range(MAX_ROUNDS):
-            p = (bundle.positions / LEVERS)[self._shaping(bundle)]
-            lack = self._lack(p)
-            if duration >= self._longest or not (lack > ROUNDING).any():
+        asked, kept = self._clearances(bundle.positions / LEVERS)
+        automatic = self._generator is not None and self._avoidance.duration is None
+        for _ in range(MAX_ROUNDS if automatic else 0):
+            lacking = self._shaping(bundle) & (asked > kept)
+            if duration >= self._longest or (asked - kept)[lacking].max(initial=0.0) <= ROUNDING:
                 break
-            more = min(self._clearing_duration(p[lack > 0]), self._longest - duration)
+            p = bundle.positions[lacking] / LEVERS
+            more = min(self._clearing_duration(p), self._longest - duration)
             duration += more
             bundle, transform = self._continued(bundle, more, duration)
-        return self._along(bundle, transform, duration)
+            asked, kept = self._clearances(bundle.positions / LEVERS)
+        return self._along(bundle, transform, duration, asked, kept)
 
     def _continued(self, bundle: Bundle, more: float, duration: float) -> tuple[Bundle, Diffeomorphism]:
         """The samples carried on by the flow, by `more` up to this duration, and its transform then."""
@@ -481,11 +482,13 @@ class _Solver:
 
     def through(self, transform: Diffeomorphism, duration: float) -> ArmSolution:
         """The motions of a transform that is there already, of which that is the full duration."""
-        return self._along(self._sampled(transform), transform, duration)
+        bundle = self._sampled(transform)
+        return self._along(bundle, transform, duration, *self._clearances(bundle.positions / LEVERS))
 
-    def _along(self, bundle: Bundle, transform: Diffeomorphism, duration: float) -> ArmSolution:
+    def _along(
+        self, bundle: Bundle, transform: Diffeomorphism, duration: float, asked: Array, kept: Array
+    ) -> ArmSolution:
         p = bundle.positions / LEVERS
-        asked, kept = self._kept(p)
         shaping, near = self._shaping(bundle), asked - kept > ROUNDING
         q = self._lifted.at(bundle.index, bundle.fraction)
         stuck, too_near = (np.unique(bundle.index[near & which]) for which in (shaping, ~shaping))
@@ -529,10 +532,10 @@ class _Solver:
 
     def _lack(self, p: Array) -> Array:
         """(N,) metres by which the arm at configurations (N, 6) misses the clearance that is asked for."""
-        asked, kept = self._kept(p)
+        asked, kept = self._clearances(p)
         return asked - kept
 
-    def _kept(self, p: Array) -> tuple[Array, Array]:
+    def _clearances(self, p: Array) -> tuple[Array, Array]:
         """Clearances (N,), metres, that are asked for at configurations (N, 6), and that are kept.
 
         Asked for is the margin, or what the starts and goal beside a configuration have. What is kept ends where it is
@@ -567,8 +570,3 @@ def clearing(
 def _on_side(obstacle: Obstacle, side: Array, previous: Detour | None) -> Detour:
     """The detour around an obstacle on a side, which goes on from the previous one, if any."""
     return Detour(obstacle, side, side, kept=previous is not None)
-
-
-def _crossing(before: Array, after: Array) -> float:
-    """Part of a step after which the last of some values (N,), above 0 before and at most 0 after it, has become 0."""
-    return float((before / np.maximum(before - after, 1e-12)).clip(0, 1).max())
