@@ -12,9 +12,10 @@ from functools import partial
 
 import numpy as np
 
-from dt_viz.avoidance.arm import BESIDE, MAX_DURATION, ROUNDING, SLOPE, WholeArm
-from dt_viz.avoidance.arm import clearing as clearing_time
+from dt_viz.avoidance.arm import BESIDE, WholeArm
 from dt_viz.avoidance.arm_field import LEVERS, REACH_PER_TEMPERATURE, SPEED, WholeArmField
+from dt_viz.avoidance.arm_solver import MAX_DURATION, ROUNDING, SLOPE
+from dt_viz.avoidance.arm_solver import clearing as clearing_time
 from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.avoidance.detour import escape_directions, turned
 from dt_viz.flows.diffeomorphisms import Conjugated, Diffeomorphism, Flow, Identity

@@ -8,8 +8,9 @@ from functools import partial
 
 import numpy as np
 
-from dt_viz.avoidance.arm import NUM_CONFIGURATIONS, Lift, WholeArm, joined, lift
+from dt_viz.avoidance.arm import WholeArm
 from dt_viz.avoidance.avoidance import ArmAvoidance
+from dt_viz.avoidance.lift import NUM_CONFIGURATIONS, Lift, joined, lift
 from dt_viz.avoidance.passing import Stance
 from dt_viz.avoidance.postures import Stances, stances
 from dt_viz.avoidance.transform import start_warnings

@@ -8,7 +8,8 @@ from itertools import islice
 
 import numpy as np
 
-from dt_viz.avoidance.arm import ArmSolution, Lift
+from dt_viz.avoidance.arm_solver import ArmSolution
+from dt_viz.avoidance.lift import Lift
 from dt_viz.avoidance.passing import ANEW, Passing
 from dt_viz.avoidance.transform import start_warnings
 from dt_viz.flows.fields import Indices

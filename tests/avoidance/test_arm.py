@@ -6,17 +6,10 @@ import numpy as np
 import pytest
 from scenes import changed
 
-from dt_viz.avoidance import arm as whole_arm
-from dt_viz.avoidance.arm import (
-    COARSE_SPACING,
-    MAX_DURATION,
-    OPPOSED,
-    ROUNDING,
-    ArmSolution,
-    Lift,
-    WholeArm,
-)
+from dt_viz.avoidance.arm import OPPOSED, WholeArm
 from dt_viz.avoidance.arm_field import LEVERS
+from dt_viz.avoidance.arm_solver import COARSE_SPACING, MAX_DURATION, ROUNDING, ArmSolution
+from dt_viz.avoidance.lift import Lift
 from dt_viz.flows.diffeomorphisms import Identity
 from dt_viz.metrics import resample_by_arc_length, sharpest_turn
 from dt_viz.motion.following import Follower
@@ -270,13 +263,13 @@ def test_where_no_way_is_free_that_is_said_and_the_exact_flow_is_made_once_and_i
     push, monkeypatch
 ):
     """The duration that is reported is the one of the motion, also where the search ends."""
-    made, solver = [], whole_arm._Solver
+    made, solver = [], push.arm._solver
 
     def recorded(*arguments, coarse):
         made.append(coarse)
         return solver(*arguments, coarse=coarse)
 
-    monkeypatch.setattr(whole_arm, "_Solver", recorded)
+    monkeypatch.setattr(push.arm, "_solver", recorded)
     solution = push.avoiding(Sphere((0.03, -0.13, 0.4), 0.14))
     assert made == [True] * (len(made) - 1) + [False] and len(made) > 2
     assert not solution.cleared
@@ -312,7 +305,7 @@ class TestTwoObstacles:
     def test_ways_out_that_are_alike_or_that_no_posture_meets_both_of_stay_as_they_are(self, push, pair, monkeypatch):
         x, y, z = pair[0].position
         for other, together in ((replace(pair[0], position=(x, y, z + 0.001)), 0.05), (pair[1], -1.0)):
-            monkeypatch.setattr(whole_arm, "TOGETHER", together)
+            monkeypatch.setattr("dt_viz.avoidance.arm.TOGETHER", together)
             alone = [self.first(push, ball)[0] for ball in (pair[0], other)]
             np.testing.assert_array_equal(self.first(push, pair[0], other), alone)
 
@@ -327,7 +320,7 @@ def test_where_the_first_way_out_is_long_the_one_with_the_least_detour_is_taken(
         found.extend([best, tried])
         return better(tried, best)
 
-    monkeypatch.setattr(whole_arm, "LONG", 0.0)
+    monkeypatch.setattr("dt_viz.avoidance.arm_solver.LONG", 0.0)
     monkeypatch.setattr(push.arm, "_better", kept)
     least = push.arm.avoiding(push.lifted, avoidance, LIVE.spacing, coarse=True)
     detours = [push.arm._detour(solution) for solution in found if solution.cleared]

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scenes import changed, frame_at, kinds, starts_at
 
-from dt_viz.avoidance.arm import LONG, NUM_CONFIGURATIONS
+from dt_viz.avoidance.arm_solver import LONG
 from dt_viz.avoidance.avoidance import ArmAvoidance
+from dt_viz.avoidance.lift import NUM_CONFIGURATIONS
 from dt_viz.control.arm_system import Section
 from dt_viz.errors import UnwantedError
 from dt_viz.motion.following import MAX_TRACKING_ERROR, NUM_ARM_SAMPLES, Follower

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scenes import biases, changed, frame_at, says, starts_at
 
-from dt_viz.avoidance.arm import MOVED
+from dt_viz.avoidance.arm_solver import MOVED
 from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.motion.following import NEWEST
 from dt_viz.motion.nominal import Nominal

@@ -1,0 +1,90 @@
+"""The joints along rollouts of the end effector: q = Q(x), one section of the inverse kinematics for all (sec. 4.5)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from dt_viz.flows.fields import Array, Indices
+from dt_viz.kernels.splines import cubics
+from dt_viz.robot.inverse_kinematics import TrackedPath, track
+from dt_viz.robot.robot import NUM_JOINTS, Robot
+
+NUM_CONFIGURATIONS = 100
+"""Samples of each rollout before refinement."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lift:
+    """The joints along each rollout: q = Q(x), a smooth function of the fraction of its base ray."""
+
+    fractions: Array
+    """(R, T) increasing along each rollout."""
+    tracked: TrackedPath
+    """Joints at these fractions; its q has shape (R, T, 6)."""
+    reference: Array
+    """(6,) posture that the arm stays near to, rad."""
+    exactly: Callable[[Array, Indices, Array], Array] | None = None
+    """Takes postures (N, 6) between the fractions onto the motion that they follow, of these rollouts (N,) at these
+    fractions (N,); None is content with the spline."""
+    num_added: int = 0
+    """Number of the rollouts, the last ones, from added starts: the avoidance is not made for these."""
+
+    @property
+    def num_shaping(self) -> int:
+        """Number of the rollouts, the first ones, that an avoidance is made for."""
+        return len(self.fractions) - self.num_added
+
+    @cached_property
+    def _splines(self) -> tuple[Array, Array]:
+        """Fractions (R, T − 1) at which the cubics begin, and their coefficients (4, R·(T − 1), 6)."""
+        coefficients = cubics(np.array(self.fractions, order="C"), np.array(self.tracked.q, order="C"))
+        return self.fractions[:, :-1], coefficients.reshape(4, -1, NUM_JOINTS)
+
+    def at(self, index: Indices, fraction: Array) -> Array:
+        """Configurations (N, 6), rad, of the rollouts `index` (N,) at the fractions `fraction` (N,)."""
+        begins, (a, b, c, d) = self._splines
+        apart = 2 * np.arange(len(begins))[:, None]  # so that one search finds the piece of the right rollout
+        piece = np.searchsorted((begins + apart).ravel(), fraction + 2 * index, side="right") - 1
+        u = (fraction - begins.ravel()[piece])[:, None]
+        q = d[piece] + u * (c[piece] + u * (b[piece] + u * a[piece]))
+        return q if self.exactly is None else self.exactly(q, index, fraction)
+
+    def only(self, rollout: int) -> Lift:
+        """One of the rollouts."""
+        q, error, limits_hit, manipulability, damped = (
+            getattr(self.tracked, name)[rollout : rollout + 1] for name in TrackedPath.__dataclass_fields__
+        )
+        tracked = TrackedPath(q, error, limits_hit, manipulability, damped)
+        return Lift(self.fractions[rollout : rollout + 1], tracked, self.reference)
+
+    @cached_property
+    def pins(self) -> Array:
+        """(R' + 1, 6) postures at the starts of the R' rollouts that shape the flow, and at the goal, rad."""
+        return np.concatenate([self.tracked.q[: self.num_shaping, 0], self.tracked.q[:1, -1]])
+
+
+def joined(lifts: Sequence[Lift], num_added: int) -> Lift:
+    """The rollouts of several, one after the other, those from added starts last, with the reference of the first."""
+    tracked = TrackedPath(
+        *(np.concatenate([getattr(part.tracked, name) for part in lifts]) for name in TrackedPath.__dataclass_fields__)
+    )
+    fractions = np.concatenate([part.fractions for part in lifts])
+    return Lift(fractions, tracked, lifts[0].reference, num_added=num_added)
+
+
+def lift(robot: Robot, fractions: Array, paths: Array, reference: Array, initial: Array | None = None) -> Lift:
+    """Follow rollouts with the joints.
+
+    Args:
+        robot: whose joints.
+        fractions: (R, T) where on their base rays the samples are.
+        paths: (R, T, 3) end effector there, metres.
+        reference: (6,) posture that the arm stays near to, rad.
+        initial: (R, T, 6) joints of nearby paths to begin from, rad.
+    """
+    start = np.broadcast_to(reference, (len(paths), NUM_JOINTS))
+    return Lift(fractions, track(robot, paths, start, initial, reference=start), reference)
