@@ -9,15 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import avoiding, biases
 
-from dt_viz.avoidance.bias import (
-    ACCEPTED,
-    AIM,
-    MAX_DURATION,
-    BiasPoint,
-    closest_distances,
-    closest_points,
-    unit_field,
-)
+from dt_viz.avoidance.bias import ACCEPTED, AIM, MAX_DURATION, BiasPoint, closest_distances, closest_points
+from dt_viz.avoidance.bias_fields import unit_field
 from dt_viz.avoidance.hand import ACCEPTED_MARGIN
 from dt_viz.avoidance.transform import MotionBelow
 from dt_viz.flows.diffeomorphisms import Chain, min_det_jacobian, round_trip_error

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import eval_hermite, expit
 
-from dt_viz.avoidance.bias import RegionField, Shift
+from dt_viz.avoidance.bias_fields import RegionField, Shift
 from dt_viz.avoidance.sideways import Sideways
 from dt_viz.flows.fields import GaussianGrid, GridRBF, PlacedField, PointField, Projected, Sum
 from dt_viz.flows.integrators import euler, implicit_euler, integrate, integrate_adaptive, rk4

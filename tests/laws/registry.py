@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 import dt_viz
 from dt_viz.avoidance.arm_field import ArmField, GradientField, JointLimits, WholeArmField
-from dt_viz.avoidance.bias import BiasPoint, Shift, unit_field
+from dt_viz.avoidance.bias import BiasPoint
+from dt_viz.avoidance.bias_fields import Shift, unit_field
 from dt_viz.avoidance.hand import Avoidance
 from dt_viz.avoidance.sideways import Sideways
 from dt_viz.avoidance.transform import Transform
