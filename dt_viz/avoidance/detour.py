@@ -30,7 +30,7 @@ class DetourSettings:
     """Choice of the way out of an obstacle.
 
     Raises:
-        FormatError: a number is not positive, or there are too many directions.
+        FormatError: a number is negative or huge, or one is 0 that divides, or there are too few or many directions.
     """
 
     along: float = 2.0
@@ -57,8 +57,9 @@ class DetourSettings:
     """Relative difference in cost over which a direction's share in its escape falls by e, for smooth drags."""
 
     def __post_init__(self) -> None:
+        least = {"num_directions": 8.0, "stride": 1e-3, "selectivity": 1e-6}
         for field in fields(self):
-            check_between(f"detour.{field.name}", getattr(self, field.name), 1e-6, 1e4)
+            check_between(f"detour.{field.name}", getattr(self, field.name), least.get(field.name, 0.0), 1e4)
 
 
 DETOUR = DetourSettings()

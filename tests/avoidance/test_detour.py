@@ -1,11 +1,15 @@
 """Ways out of an obstacle against brute force: shift the spheres and look."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dt_viz.avoidance.detour import DETOUR, escape_directions
-from dt_viz.obstacles.shapes import Sphere
+from dt_viz.avoidance.detour import DETOUR, DetourSettings, escape_directions
+from dt_viz.avoidance.hand import HandAvoidance
+from dt_viz.avoidance.transform import MotionBelow
+from dt_viz.errors import FormatError
+from dt_viz.obstacles.shapes import Box, Sphere
 
 NOWHERE = np.zeros((1, 3))  # tangents that make no direction dearer than another
 SHIFTS = np.linspace(0, 0.8, 1601)
@@ -137,3 +141,24 @@ def test_nobody_runs_away_along_the_way_of_a_moving_obstacle():
     far_ahead = [[0.4, -0.1, 2.0], [0.4, 0.1, 2.0]]
     for place in far_ahead:
         np.testing.assert_allclose(way_out(10.0, 0.0, 0.0, beyond=place), fast, rtol=0, atol=1e-12)
+
+
+def test_settings_are_those_of_the_avoidance():
+    """A detour along the motion costs what its avoidance says, and the previous one stays for as long as that says."""
+    mean = np.linspace([-0.3, 0.02, 2.0], [0.3, -0.02, 2.0], 61)
+    motion = MotionBelow(mean[:1], mean[-1], np.zeros(61, int), mean)
+    oblique = Box((0.0, 0.0, 2.0), (0.05, 0.3, 0.3))
+
+    def direction(**settings):
+        (detour,) = HandAvoidance(oblique, detour=DetourSettings(**settings)).build(motion).detours
+        return detour.direction
+
+    assert abs(direction(along=0.0)[0]) > 0.9 and abs(direction(along=50.0)[0]) < 0.4
+    obstacle, radius, points = Sphere((0.0, 0.0, 2.0), 0.15), np.array([0.05]), np.array([[[0.0], [0.0], [2.02]]])
+    for staying, up in ((1.0, True), (10.0, False)):
+        settings = DetourSettings(staying=staying)
+        first = escape_directions(points, radius, NOWHERE, obstacle, previous=-np.eye(3)[2], settings=settings)[0]
+        assert (first[2] > 0) == up
+    for wrong in ({"num_directions": 1}, {"stride": 0.0}, {"staying": np.nan}, {"along": -1.0}):
+        with pytest.raises(FormatError, match=f"detour.{next(iter(wrong))}: found"):
+            DetourSettings(**wrong)
