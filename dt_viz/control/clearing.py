@@ -33,8 +33,6 @@ COARSE_STEP = 0.2
 """Length of a Runge–Kutta step, in flow time."""
 BEYOND = 0.03
 """Reach of the field beyond the margin, metres, at least."""
-LAG = 8e-3
-"""Clearance that the flow makes beyond the margin, metres: the arm follows its target with a lag."""
 NO_PINS = np.empty((0, NUM_JOINTS))
 
 
@@ -145,5 +143,5 @@ def lack(arm: WholeArm, p: Array, avoidance: ArmAvoidance, end: Array | None) ->
     pins = NO_PINS if end is None else end[None]
     room = arm.clearance(pins, avoidance.avoided) - ROUNDING
     pins, room = pins[room > 0], room[room > 0]
-    asked = room_asked(np.array(p, order="C"), pins, room, LEVERS, SLOPE, float(avoidance.margin) + LAG)
+    asked = room_asked(np.array(p, order="C"), pins, room, LEVERS, SLOPE, float(avoidance.margin))
     return asked - arm.clearance(p, avoidance.avoided, asked + SPEED * STEP)

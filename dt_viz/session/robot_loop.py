@@ -259,12 +259,8 @@ class LiveArm:
 
     def _go_round(self, controller: ArmController, seconds: float) -> None:
         """Set out for the next start, or from there for the goal, when the robot has rested."""
-        phase, homing, before, settings = (
-            controller.phase,
-            controller.heading is Phase.HOMING,
-            self._round,
-            self._settings,
-        )
+        phase, homing = controller.phase, controller.heading is Phase.HOMING
+        before, settings = self._round, self._settings
         rests = phase in (Phase.RESTING, Phase.ASIDE)
         rested = before.rested + seconds if rests else 0.0
         arrives = before.arrived > 0 or (rests and not homing)

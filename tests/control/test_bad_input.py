@@ -7,7 +7,7 @@ from scenes import changed
 
 from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.control.controller import ArmController, Phase
-from dt_viz.control.limits import ContactLimit
+from dt_viz.control.limits import FASTEST, ContactLimit
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.kernels.proximity import contacts, least_contacts
 from dt_viz.motion.stack import LIVE
@@ -154,6 +154,15 @@ def test_a_robot_that_is_folded_does_not_touch_itself(live):
             closest = min(closest, apart.distance if (apart := model.nearest_to_itself(live.q[None])) else np.inf)
     assert "kept from itself" in said and closest > 0
     live.goes_on()
+
+
+def test_links_come_near_the_table_and_each_other_no_faster_than_is_reckoned_with(live):
+    body, postures = live.follower.body, np.random.default_rng(0).uniform(-np.pi, np.pi, (300, 6))
+    for make in (ContactLimit.table, ContactLimit.itself):
+        pairs = make(live.robot, body, 5e-3, 20.0).pairs
+        found = [contacts(live.robot.records, body.spheres, pairs, q, 9.0) for q in postures]
+        _, apart, slopes = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        assert (np.abs(slopes[apart > 0]) @ live.robot.velocity_limits).max() < FASTEST
 
 
 def test_distances_of_contacts_have_these_slopes(live):

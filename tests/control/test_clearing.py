@@ -52,7 +52,7 @@ def test_all_that_lies_ahead_is_cleared_and_the_end_stays(arm, q):
     avoidance = around(arm, q[50])
     found, p = made(arm, q, avoidance)
     assert found.cleared and arm.clearance(q, avoidance.avoided).min() < -0.05
-    assert arm.clearance(p, avoidance.avoided).min() > MARGIN - 1.5e-3
+    assert arm.clearance(p, avoidance.avoided).min() == pytest.approx(MARGIN, abs=1.5e-3)
     np.testing.assert_allclose(p[-1], q[-1], atol=1e-9)
 
 

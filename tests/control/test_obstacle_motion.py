@@ -77,12 +77,7 @@ def test_obstacles_keep_their_motion_while_others_come_and_go():
 def test_what_is_put_elsewhere_or_replaced_is_not_moving():
     last = moving()[-1]
     assert seen([*moving(), last + 0.5]).speed == 0
-    other = ArmAvoidance(
-        Box(
-            as_point(last),
-            (0.1, 0.1, 0.1),
-        )
-    )
+    other = ArmAvoidance((Box(as_point(last), (0.1, 0.1, 0.1)),))
     assert seen(moving()).then(other, 20 * PERIOD, SETTINGS).speed == 0
     assert seen(moving()).then(None, 20 * PERIOD, SETTINGS).expected(1, 1, RATE) is None
 

@@ -63,11 +63,10 @@ def test_velocities_are_those_of_array_operations(field, postures):
 
 def test_derivatives_are_those_of_array_operations(field, postures):
     direction = np.random.default_rng(5).normal(size=(NUM, 6))
-    expected = np.imag(plain_escape.velocities(field, postures + 1j * COMPLEX_STEP * direction)) / COMPLEX_STEP
-    _, jacobian = field.with_jacobian(postures)
-    # beside kinks of the second derivative, where distances of a grid or box meet, differences see both sides
-    off = np.abs(np.einsum("nij,nj->ni", jacobian, direction) - expected).max(axis=1)
-    assert (off > 1e-6).sum() <= 1 and off.max() < 1e-2
+    q = postures + 0.01  # one of these is 12 µrad beside a kink, where a grid's distance begins: differences cross it
+    expected = np.imag(plain_escape.velocities(field, q + 1j * COMPLEX_STEP * direction)) / COMPLEX_STEP
+    _, jacobian = field.with_jacobian(q)
+    np.testing.assert_allclose(np.einsum("nij,nj->ni", jacobian, direction), expected, rtol=0, atol=1e-6)
 
 
 def test_clearance_is_that_of_array_operations(field, postures):
@@ -99,10 +98,10 @@ def test_adaptive_steps_are_as_exact_as_those_of_array_operations(field, posture
     """Not the same: array operations take the steps of the strictest posture for all."""
     before = postures.copy()
     exact, _ = integrate(rk4, field, postures, None, -0.7, 2000)
-    plain, _ = integrate_adaptive(Plain(field), postures, None, -0.7, 1e-6)
-    carried, _ = integrate_adaptive(field, postures, None, -0.7, 1e-6)
-    np.testing.assert_allclose(plain, exact, rtol=0, atol=2e-4)
-    np.testing.assert_allclose(carried, exact, rtol=0, atol=2e-4)
+    plain, _ = integrate_adaptive(Plain(field), postures, None, -0.7, 1e-8)
+    carried, _ = integrate_adaptive(field, postures, None, -0.7, 1e-8)
+    np.testing.assert_allclose(plain, exact, rtol=0, atol=5e-6)
+    np.testing.assert_allclose(carried, exact, rtol=0, atol=5e-6)
     np.testing.assert_array_equal(postures, before)
 
 

@@ -92,7 +92,7 @@ class TestCover:
     @each_link
     def test_the_smallest_spheres_of_a_joint_cover_its_links(self, body, mesh):
         smallest = cover(body)
-        assert uncovered(smallest, mesh) <= 3e-4
+        assert uncovered(smallest, mesh) <= 1e-6
         # which would be seen otherwise
         assert uncovered(changed(smallest, radius=-2e-3), mesh) > 5e-4
         assert uncovered(changed(smallest, offset=5e-3), mesh) > 5e-4
@@ -178,7 +178,7 @@ def test_where_the_spheres_clear_an_obstacle_the_meshes_clear_it_by_at_least_as_
 
         def wrong(body, q=q, obstacle=obstacle, true=true):
             promised = body.clearance(robot, q[None], obstacle)[0]
-            return not promised - 3e-4 <= true <= promised + PROTRUSION + 4e-4
+            return not promised - 1e-6 <= true <= promised + PROTRUSION + 4e-4
 
         if true > 0:
             assert not wrong(body)
