@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.integrate import cumulative_trapezoid, solve_ivp
 
-from dt_viz.baselines.base import Method, Plan, Planner, Problem
+from dt_viz.baselines.base import Method, NotFittedError, Plan, Planner, Problem
 from dt_viz.errors import Cancelled, never
 from dt_viz.flows.fields import Array
 from dt_viz.flows.rollouts import ARRIVED
@@ -155,4 +155,7 @@ class Modulation(Method):
 
     def fit(self, problem: Problem) -> Planner:
         """Take what is learned already; see `Method`."""
-        return _Planner(problem.learned.system, self.settings)
+        system = problem.learned.system
+        if system.transform.dim != problem.task.starts.shape[1]:
+            raise NotFittedError("modulation turns velocities at places; this task is learned in augmented states")
+        return _Planner(system, self.settings)

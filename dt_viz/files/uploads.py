@@ -54,12 +54,12 @@ class _Process:
         giving.start()
         try:
             self._wait(cancelled)
-            if self._process.returncode:
+            self._answer.seek(1)  # behind the line that says that it is ready
+            line = self._answer.readline(2**16)
+            if self._process.returncode or not line:
                 found = f"something that ended its reader ({self._process.returncode})"
                 raise FormatError("file", found, "a whole file")
-            self._answer.seek(0)
-            self._answer.readline(1)
-            first = json.loads(self._answer.readline(2**16))
+            first = json.loads(line)
             if "refused" in first:
                 field, found, accepted = map(str, first["refused"])
                 raise FormatError(field, found, accepted)

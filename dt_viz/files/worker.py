@@ -10,29 +10,14 @@ from __future__ import annotations
 import json
 import sys
 from contextlib import suppress
-from dataclasses import dataclass
 
 import numpy as np
 
 from dt_viz.errors import FormatError
 from dt_viz.files.shapes import KINDS
 
-
-@dataclass(frozen=True)
-class ProcessLimits:
-    """What the process may use."""
-
-    memory: int = 2**30
-    """Largest address space, bytes."""
-    seconds: int = 15
-    """Longest time of the processor."""
-    answer: int = 10**8
-    """Largest number of bytes of an answer."""
-    num_files: int = 32
-    """Largest number of open files."""
-
-
-LIMITS = ProcessLimits()
+MEMORY = 2**30
+"""Largest address space of the process, bytes."""
 
 
 def limit() -> None:
@@ -43,10 +28,10 @@ def limit() -> None:
         return
     used = resource.getrusage(resource.RUSAGE_SELF)
     limits = {
-        "RLIMIT_AS": LIMITS.memory,
-        "RLIMIT_CPU": LIMITS.seconds + int(used.ru_utime + used.ru_stime) + 1,
-        "RLIMIT_FSIZE": LIMITS.answer,
-        "RLIMIT_NOFILE": LIMITS.num_files,
+        "RLIMIT_AS": MEMORY,
+        "RLIMIT_CPU": 15 + int(used.ru_utime + used.ru_stime) + 1,  # seconds for the file
+        "RLIMIT_FSIZE": 10**8,  # bytes of an answer
+        "RLIMIT_NOFILE": 32,  # open files
         "RLIMIT_CORE": 0,
     }
     for name, most in limits.items():
@@ -61,9 +46,7 @@ def answer(kind: str, suffix: str, content: bytes) -> tuple[dict[str, object], t
     except FormatError as error:
         return {"refused": [error.field, error.found, error.accepted]}, ()
     except MemoryError:
-        return {
-            "refused": ["file", f"data that need more than {LIMITS.memory / 1e9:.0f} GB to read", "a smaller file"]
-        }, ()
+        return {"refused": ["file", f"data that need more than {MEMORY / 1e9:.0f} GB to read", "a smaller file"]}, ()
     except Exception as error:  # no reader lists what corrupt bytes make it raise
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         return {"refused": ["file", f"something that cannot be read ({reason})", f"a {suffix} file"]}, ()

@@ -3,11 +3,14 @@
 import numpy as np
 import pytest
 
+from dt_viz.baselines.base import NotFittedError
 from dt_viz.baselines.modulation import Modulation, ModulationSettings, modulated
+from dt_viz.baselines.registry import problem_of
 from dt_viz.flows.systems import stepped
 from dt_viz.metrics import distance_from_path
 from dt_viz.obstacles.shapes import Box, Cylinder, Sphere, as_point
 from dt_viz.obstacles.union import Union
+from dt_viz.scenario.scenario import Scenario
 
 SPHERE = Union((Sphere((0.1, -0.5, 0.3), 0.15),))
 OBSTACLES = (
@@ -74,9 +77,15 @@ def test_without_an_obstacle_the_motions_are_the_imitation(problem):
 def test_on_the_page_it_stays_near_the_motion_that_is_exact(problem, in_the_way):
     start = problem.task.starts[:1]
     (quick,), (exact,) = (
-        Modulation(ModulationSettings(t)).fit(problem).plan(in_the_way, start).paths for t in (1e-3, 1e-5)
+        Modulation(s).fit(problem).plan(in_the_way, start).paths for s in (None, ModulationSettings(tolerance=1e-5))
     )
     assert distance_from_path(quick, exact).max() < 0.01
+
+
+def test_a_task_in_augmented_states_is_refused_by_one_line(engine):
+    drawn = problem_of(engine.nominal(Scenario("draw_8")).learned, engine.follower)
+    with pytest.raises(NotFittedError, match="augmented"):
+        Modulation().fit(drawn)
 
 
 def test_a_motion_straight_at_the_centre_stops_before_the_obstacle(problem):

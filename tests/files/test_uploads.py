@@ -31,9 +31,9 @@ def _ready(monkeypatch):
 def reader(tmp_path, monkeypatch):
     """Replaces the program of the process."""
 
-    def replace(text: str) -> None:
+    def replace(text: str, *, begins: bool = True) -> None:
         name = f"reader_{tmp_path.name.strip('0123456789_')}"
-        (tmp_path / f"{name}.py").write_text("print(flush=True)\n" + textwrap.dedent(text))
+        (tmp_path / f"{name}.py").write_text("print(flush=True)\n" * begins + textwrap.dedent(text))
         monkeypatch.syspath_prepend(tmp_path)
         monkeypatch.setattr(worker, "__name__", name)
 
@@ -58,7 +58,7 @@ def test_what_is_refused_says_why_in_one_line():
     [
         "x = bytearray(2 * 10**9)",
         "import resource; resource.setrlimit(resource.RLIMIT_CPU, (1, 1))\nwhile True: pass",
-        "sys.stdout.buffer.write(bytes(2 * worker.LIMITS.answer))",
+        "sys.stdout.buffer.write(bytes(2 * 10**8))",
         "import os; os.abort()",
         "sockets = [__import__('socket').socket() for _ in range(100)]",
     ],
@@ -87,10 +87,19 @@ def test_what_hangs_is_ended(reader, monkeypatch):
 
 
 def test_what_never_begins_is_ended(reader, monkeypatch):
-    reader("import time; time.sleep(1000)")
-    monkeypatch.setattr(uploads, "START", 0.0)
+    reader("import time; time.sleep(1000)", begins=False)
+    monkeypatch.setattr(uploads, "START", 0.3)
+    start = time.monotonic()
     with pytest.raises(FormatError, match="take more than"):
         read_upload("mesh", ".stl", bytes(10**7))
+    assert time.monotonic() - start < uploads.PATIENCE
+
+
+@pytest.mark.parametrize("begins", [False, True])
+def test_what_ends_without_an_answer_says_so(reader, begins):
+    reader("", begins=begins)
+    with pytest.raises(FormatError, match="ended its reader"):
+        read_upload("mesh", ".stl", BOX)
 
 
 def test_it_ends_when_its_visitor_leaves(reader):

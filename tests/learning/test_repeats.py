@@ -20,9 +20,12 @@ from dt_viz.scenario.tasks import TASKS
 STATES = ("plain", "augmented")
 NOISE = 1e-12
 """Deviation of demonstrations that are the same but for rounding, relative to their extent."""
-ALIKE = 1e-5
+ALIKE = 1e-6
 """Largest distance of motions that are the same but for rounding, relative to the extent: what rounding grows to in a
-fit that turns far or has to leave a symmetric saddle, as of mirrored demonstrations, with room to spare."""
+fit that turns far, with room to spare."""
+SADDLE = 1e-5
+"""The same for the plain fit of mirrored demonstrations, which has to leave a symmetric saddle: up to 2.6e-6 was
+measured there, and 1.3e-9 in all other cases of the quick tests."""
 BESIDE = 0.02
 """Deviation of starts beside the demonstrated ones, relative to the extent."""
 FITTED_ELSEWHERE = ("draw_s", "draw_g", "push_box")
@@ -56,11 +59,11 @@ def rounded(demonstrations, rng):
     return [replace(d, positions=d.positions + noise * rng.normal(size=d.positions.shape)) for d in demonstrations]
 
 
-def assert_repeated(demonstrations, state, seed=0):
+def assert_repeated(demonstrations, state, seed=0, alike=ALIKE):
     """What is learned does not change with the rounding of demonstrations and with their order."""
     rng = np.random.default_rng(seed)
     found = motions(rounded(demonstrations, rng), state, rng.permutation(len(demonstrations)))
-    assert np.abs(found - motions(demonstrations, state)).max() < ALIKE * extent(demonstrations)
+    assert np.abs(found - motions(demonstrations, state)).max() < alike * extent(demonstrations)
 
 
 @pytest.mark.parametrize("state", STATES)
@@ -88,7 +91,7 @@ for the side on which to pass."""
 @pytest.mark.parametrize("state", STATES)
 @pytest.mark.parametrize("name", EVEN)
 def test_exactly_even_demonstrations_decide_nothing_by_rounding(name, state):
-    assert_repeated(EVEN[name], state)
+    assert_repeated(EVEN[name], state, alike=SADDLE if (name, state) == ("mirrored", "plain") else ALIKE)
 
 
 @pytest.mark.parametrize("name", ["crossing at equal phase", "left and right from one start", "reach and retreat"])
