@@ -13,7 +13,7 @@ from dt_viz.flows.fields import Array, Mask
 from dt_viz.flows.rollouts import Rays
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.obstacles.union import Union
-from dt_viz.pictures.slice_fields import SETTINGS, Clearance, everywhere, streamlines
+from dt_viz.pictures.slice_fields import GRID_SPACING, Clearance, everywhere, streamlines
 from dt_viz.scenario.slices import Slice, level_line
 
 MARGIN = 0.18
@@ -172,7 +172,7 @@ def base_panel(title: str, fit: Fit, *, grid: bool) -> PanelPicture:
     """
     rays, seen = fit.rays, fit.base_area
     system = DiffeomorphicSystem(Identity(rays.base.dim), rays.base)
-    lines, spacing = [], SETTINGS.grid_spacing
+    lines, spacing = [], GRID_SPACING
     for axis, (half, middle) in enumerate(zip(seen.half_size, seen.across(rays.base.goal), strict=True)):
         for k in range(-int((half + middle) / spacing), 1 + int((half - middle) / spacing)) if grid else ():
             ends = np.array([-1.0, 1.0])[:, None] * seen.half_size

@@ -15,32 +15,25 @@ from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.scenario.scenario import SliceColour
 from dt_viz.scenario.slices import Slice, level_line
 
-
-@dataclass(frozen=True)
-class SliceSettings:
-    """How densely a slice is covered; lengths in metres."""
-
-    arrow_spacing: float = 0.030
-    """Spacing of the arrows."""
-    lattice: float = 0.008
-    """Spacing of the lattice on which functions are sampled; a coarse picture has the arrows'."""
-    grid_spacing: float = 0.035
-    """Spacing in base space of the lines whose images are the warped grid."""
-    coarse_lattice: float = 0.012
-    """Spacing of the lattice on which those of a coarse picture are found."""
-    level_spacing: float = 0.04
-    """Spacing of the base attractor's circles whose images are the level lines of the Lyapunov value."""
-    separation: float = 0.032
-    """Distance from all other streamlines at which one may begin, and its least length; it ends at half of it."""
-    max_offset: float = 0.10
-    """Distance from the slice at which a streamline ends."""
-    line: float = 0.006
-    """Distance between neighbouring samples of a drawn streamline."""
-    coarse_line: float = 0.014
-    """The distance of a coarse picture."""
-
-
-SETTINGS = SliceSettings()
+# how densely a slice is covered; lengths in metres
+ARROW_SPACING = 0.030
+"""Spacing of the arrows."""
+LATTICE = 0.008
+"""Spacing of the lattice on which functions are sampled; a coarse picture has the arrows'."""
+GRID_SPACING = 0.035
+"""Spacing in base space of the lines whose images are the warped grid."""
+COARSE_LATTICE = 0.012
+"""Spacing of the lattice on which those of a coarse picture are found."""
+LEVEL_SPACING = 0.04
+"""Spacing of the base attractor's circles whose images are the level lines of the Lyapunov value."""
+SEPARATION = 0.032
+"""Distance from all other streamlines at which one may begin, and its least length; it ends at half of it."""
+MAX_OFFSET = 0.10
+"""Distance from the slice at which a streamline ends."""
+LINE = 0.006
+"""Distance between neighbouring samples of a drawn streamline."""
+COARSE_LINE = 0.014
+"""The distance of a coarse picture."""
 
 Clearance = Callable[[Array], Array]
 """Function from points (N, 3) to their distances (N,) from the blocked region, metres, negative inside."""
@@ -133,7 +126,6 @@ def arrows_and_colour(
     *,
     arrows: bool,
     coarse: bool,
-    settings: SliceSettings = SETTINGS,
 ) -> tuple[FieldPicture | None, ColourPicture | None]:
     """Compute velocities on the slice, if `arrows` are wanted, and the function that the `colour` shows, if any.
 
@@ -142,23 +134,23 @@ def arrows_and_colour(
     draw = {"det": det_jacobian, "lyapunov": lyapunov_value}.get(colour)
     field, samples = None, None
     if arrows or (draw and coarse):
-        samples = Samples(system, area, clearance, settings.arrow_spacing)
+        samples = Samples(system, area, clearance, ARROW_SPACING)
         field = samples.field if arrows else None
     if not draw:
         return field, None
     if samples is None or not coarse:
-        samples = Samples(system, area, clearance, settings.lattice)
-    return field, draw(samples, settings)
+        samples = Samples(system, area, clearance, LATTICE)
+    return field, draw(samples)
 
 
-def grid_lines(system: DiffeomorphicSystem, area: Slice, *, coarse: bool, settings: SliceSettings = SETTINGS) -> Array:
+def grid_lines(system: DiffeomorphicSystem, area: Slice, *, coarse: bool) -> Array:
     """Find segments (K, 2, 3), metres, where coordinates of ψ along the slice are multiples of the grid's spacing.
 
     They are counted from the goal, so that two lines cross there. In a drawing's plane these are the images of a
     lattice of straight lines under ψ⁻¹.
     """
-    samples = Samples(system, area, everywhere, settings.coarse_lattice if coarse else settings.lattice)
-    across, spacing = (samples.images - system.base.goal) @ area.axes, settings.grid_spacing
+    samples = Samples(system, area, everywhere, COARSE_LATTICE if coarse else LATTICE)
+    across, spacing = (samples.images - system.base.goal) @ area.axes, GRID_SPACING
     levels = [spacing * np.arange(np.ceil(x.min() / spacing), 1 + np.floor(x.max() / spacing)) for x in across.T]
     return np.concatenate([samples.level_lines(x, at) for x, at in zip(across.T, levels, strict=True)])
 
@@ -168,15 +160,15 @@ def everywhere(points: Array) -> Array:
     return np.full(len(points), np.inf)
 
 
-def det_jacobian(samples: Samples, _: SliceSettings = SETTINGS) -> ColourPicture:
+def det_jacobian(samples: Samples) -> ColourPicture:
     """Compute det J of ψ: the ratio of a small volume in base space to the original; ≤ 0 where ψ folds."""
     values = samples.spread(np.linalg.det(samples.jacobians[1]))
     return ColourPicture("det", samples.area, values, samples.clearance, np.empty((0, 2, 3)))
 
 
-def lyapunov_value(samples: Samples, settings: SliceSettings = SETTINGS) -> ColourPicture:
+def lyapunov_value(samples: Samples) -> ColourPicture:
     """Compute Φ(ψ(y)), which falls along every motion, and level lines: images of evenly spaced circles."""
-    base, spacing = samples.system.base, settings.level_spacing
+    base, spacing = samples.system.base, LEVEL_SPACING
     values = base.potential(samples.images)
     highest, levels = values.max(initial=0.0), (base.potential_at(spacing * k) for k in itertools.count(1))
     below = itertools.takewhile(lambda level: level < highest, levels)
@@ -184,20 +176,18 @@ def lyapunov_value(samples: Samples, settings: SliceSettings = SETTINGS) -> Colo
     return ColourPicture("lyapunov", samples.area, samples.spread(values), samples.clearance, lines)
 
 
-def streamlines(
-    system: DiffeomorphicSystem, area: Slice, clearance: Clearance, *, coarse: bool, settings: SliceSettings = SETTINGS
-) -> tuple[Array, ...]:
+def streamlines(system: DiffeomorphicSystem, area: Slice, clearance: Clearance, *, coarse: bool) -> tuple[Array, ...]:
     """Compute evenly spaced motions from places on the slice, each (T_i, 3), metres, as far as they stay over it.
 
     They are exact: by conjugacy a streamline through y is ψ⁻¹ of the ray through ψ(y). Each ends where it comes too
     close to an earlier one, and the remaining gaps are filled, after Jobard and Lefer, "Creating Evenly-Spaced
     Streamlines of Arbitrary Density" (1997).
     """
-    marks, starts, trials, lengths = _Marks(area, settings), [], [], []
+    marks, starts, trials, lengths = _Marks(area), [], [], []
     num = 64  # samples from which the end of a streamline is found
     u = np.linspace(0, 1, num)
     for finer in (0.5, 1, 2):
-        seeds = area.lattice(settings.separation / finer)
+        seeds = area.lattice(SEPARATION / finer)
         seeds = seeds[~marks.crowded(seeds) & (clearance(seeds) > 0)]
         # from the rim inwards: those are long, and their order does not change with the motion
         seeds = seeds[np.argsort(-np.abs(area.across(seeds) / area.half_size).max(axis=1).round(6), kind="stable")]
@@ -214,7 +204,7 @@ def streamlines(
     index, sample = np.nonzero(kept)
     rays = Rays(np.concatenate(starts), system.base)
     bundle = Bundle(index, u[sample], np.concatenate(trials)[kept][:, None])
-    spacing, rounds = (settings.coarse_line, 1) if coarse else (settings.line, 3)
+    spacing, rounds = (COARSE_LINE, 1) if coarse else (LINE, 3)
     return refined(
         bundle, lambda i, u: system.transform.inverse(rays.at(i, u))[:, None], spacing, max_rounds=rounds
     ).paths
@@ -223,9 +213,9 @@ def streamlines(
 class _Marks:
     """Cells near streamlines, on a lattice of small cubes over the slice."""
 
-    def __init__(self, area: Slice, settings: SliceSettings) -> None:
-        self._area, self._shortest, self._cell, border = area, settings.separation, settings.separation / 3, 4
-        self._half = np.array([*area.half_size, settings.max_offset])
+    def __init__(self, area: Slice) -> None:
+        self._area, self._shortest, self._cell, border = area, SEPARATION, SEPARATION / 3, 4
+        self._half = np.array([*area.half_size, MAX_OFFSET])
         shape = np.ceil(2 * self._half / self._cell).astype(int) + 2 * border + 1
         self._stride, self._border = np.array([shape[1] * shape[2], shape[2], 1]), border
         self._near, self._nearer = np.zeros((2, shape.prod()), bool)

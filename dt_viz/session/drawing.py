@@ -23,7 +23,7 @@ from dt_viz.pictures.arm_field import Lattice
 from dt_viz.pictures.occupancy import occupancy_picture
 from dt_viz.pictures.panels import PanelPicture, generator_panel, system_panel
 from dt_viz.pictures.sketchbook import BASE_TITLE, Pictures, Sketchbook, in_frame
-from dt_viz.pictures.slice_fields import SETTINGS, FieldPicture, arrows_and_colour, streamlines
+from dt_viz.pictures.slice_fields import ARROW_SPACING, FieldPicture, arrows_and_colour, streamlines
 from dt_viz.robot.retiming import within_velocity_limits
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.panels import BASE_PANEL, Panel, offsets
@@ -81,7 +81,7 @@ def system_of(frame: Frame, level: int) -> DiffeomorphicSystem:
 
 def lattice(frame: Frame) -> Array:
     """Places (M, 3) of the arrows on the slice, metres."""
-    return frame.slice.lattice(SETTINGS.arrow_spacing)
+    return frame.slice.lattice(ARROW_SPACING)
 
 
 def velocities(frame: Frame, learned: Array) -> Array:

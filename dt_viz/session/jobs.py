@@ -47,8 +47,9 @@ class Jobs:
             if lane in self._lanes:
                 self._lanes[lane].append(work)
             else:
-                self._lanes[lane] = deque([work])
+                # it waits until this lets go; a lane without a thread, where none can start, would be busy for ever
                 threading.Thread(target=self._run, args=(lane,), name=lane, daemon=True).start()
+                self._lanes[lane] = deque([work])
             self._changed.notify_all()
             return dropped
 

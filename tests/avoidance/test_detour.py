@@ -1,5 +1,7 @@
 """Ways out of an obstacle against brute force: shift the spheres and look."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -151,6 +153,7 @@ def test_settings_are_those_of_the_avoidance():
 
     def direction(**settings):
         (detour,) = HandAvoidance(oblique, detour=DetourSettings(**settings)).build(motion).detours
+        assert detour.direction is not None
         return detour.direction
 
     assert abs(direction(along=0.0)[0]) > 0.9 and abs(direction(along=50.0)[0]) < 0.4
@@ -159,6 +162,7 @@ def test_settings_are_those_of_the_avoidance():
         settings = DetourSettings(staying=staying)
         first = escape_directions(points, radius, NOWHERE, obstacle, previous=-np.eye(3)[2], settings=settings)[0]
         assert (first[2] > 0) == up
-    for wrong in ({"num_directions": 1}, {"stride": 0.0}, {"staying": np.nan}, {"along": -1.0}):
+    refused: list[dict[str, Any]] = [{"num_directions": 1}, {"stride": 0.0}, {"staying": np.nan}, {"along": -1.0}]
+    for wrong in refused:
         with pytest.raises(FormatError, match=f"detour.{next(iter(wrong))}: found"):
             DetourSettings(**wrong)

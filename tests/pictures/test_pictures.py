@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 
 from dt_viz.motion.stack import FINE, LIVE, build_stack
 from dt_viz.obstacles.shapes import Sphere
-from dt_viz.pictures.slice_fields import SETTINGS
+from dt_viz.pictures.slice_fields import GRID_SPACING, LATTICE
 from dt_viz.scenario.panels import BASE_PANEL
 from dt_viz.scenario.scenario import View
 from dt_viz.session.frame import Stage
@@ -41,9 +41,9 @@ def on_slice(task, points):
 def off_lattice(points, task, system):
     """Distances (N,) of points (N, 3) on the slice, metres, from where ψ takes them onto the grid's lattice."""
     z, J = system.transform.jacobian(points)
-    across, axes = (z - system.base.goal) @ task.slice.axes / SETTINGS.grid_spacing, task.slice.axes
+    across, axes = (z - system.base.goal) @ task.slice.axes / GRID_SPACING, task.slice.axes
     slope = np.linalg.norm(axes.T @ J @ axes, axis=2)
-    return (SETTINGS.grid_spacing * np.abs(across - across.round()) / slope).min(axis=1)
+    return (GRID_SPACING * np.abs(across - across.round()) / slope).min(axis=1)
 
 
 def test_pictures_are_worked_out_only_while_they_are_shown_and_never_before_the_rollouts(engine, scenario):
@@ -56,7 +56,7 @@ def test_pictures_are_worked_out_only_while_they_are_shown_and_never_before_the_
 @pytest.mark.parametrize("wanted", [Stage.LIVE, Stage.FINE])
 def test_the_warped_grid_of_the_identity_is_the_grid(engine, scenario, wanted):
     frame = frame_at(engine, bare(replace(scenario, imitation=False)), wanted)
-    lines, spacing = on_slice(frame.task, frame.pictures.grid), SETTINGS.grid_spacing
+    lines, spacing = on_slice(frame.task, frame.pictures.grid), GRID_SPACING
     along = np.abs(np.diff(lines, axis=1)[:, 0, :2])
     np.testing.assert_allclose(along.min(axis=1), 0, atol=1e-8)
     for axis in range(2):
@@ -88,8 +88,8 @@ def test_the_grid_covers_the_slice_wherever_it_is_and_is_smooth(engine, scenario
     assert (np.abs(area.across(points)) <= np.array(area.half_size) + 1e-4).all()
     assert np.abs((points - area.centre) @ area.normal).max() < 3e-3  # between samples
     empty, _ = KDTree(points).query(area.lattice(0.03))
-    assert np.quantile(empty, 0.95) < SETTINGS.grid_spacing
-    assert np.linalg.norm(np.diff(lines, axis=1), axis=2).max() <= 2 * SETTINGS.lattice
+    assert np.quantile(empty, 0.95) < GRID_SPACING
+    assert np.linalg.norm(np.diff(lines, axis=1), axis=2).max() <= 2 * LATTICE
 
 
 def test_the_grid_keeps_out_of_the_obstacle_as_the_motions_do(engine, scenario):

@@ -8,7 +8,7 @@ from scenes import biases, changed, frame_at, tilted
 
 from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.motion.stack import FINE, LIVE, build_stack, cut_off
-from dt_viz.pictures.slice_fields import SETTINGS
+from dt_viz.pictures.slice_fields import MAX_OFFSET, SEPARATION
 from dt_viz.scenario.scenario import SLICE_COLOURS, View
 from dt_viz.scenario.stack import levels, surroundings
 from dt_viz.session.frame import Stage
@@ -114,15 +114,15 @@ def test_streamlines_keep_apart_fill_the_slice_and_stay_over_it(engine, scenario
     frame = shown(engine, scenario, streamlines=True)
     area, lines = frame.slice, frame.pictures.streamlines
     points = np.concatenate(lines)
-    assert (np.abs((points - area.centre) @ area.normal) < 1.2 * SETTINGS.max_offset).all()
+    assert (np.abs((points - area.centre) @ area.normal) < 1.2 * MAX_OFFSET).all()
     starts = np.stack([line[0] for line in lines])
     for k, start in enumerate(starts):
         others = np.concatenate([line for j, line in enumerate(lines) if j != k])
-        assert np.linalg.norm(others - start, axis=1).min() > 0.35 * SETTINGS.separation
+        assert np.linalg.norm(others - start, axis=1).min() > 0.35 * SEPARATION
     free = area.lattice(0.02)
     free = free[scenario.obstacle.signed_distance(free) > 0.05]
     empty = np.array([np.linalg.norm(points - place, axis=1).min() for place in free])
-    assert np.quantile(empty, 0.9) < 1.2 * SETTINGS.separation
+    assert np.quantile(empty, 0.9) < 1.2 * SEPARATION
 
 
 @pytest.mark.parametrize("wanted", [Stage.LIVE, Stage.FINE])

@@ -192,3 +192,16 @@ def test_closing_lets_running_work_end_and_drops_what_waits_and_what_comes_later
     jobs.settle()
     jobs.note("too late")
     assert jobs.wait_idle(LANE, 1.0) and jobs.done == [True]
+
+
+def test_a_lane_whose_thread_cannot_start_works_as_soon_as_one_can(jobs, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            threading.Thread, "start", lambda _: (_ for _ in ()).throw(RuntimeError("can't start new thread"))
+        )
+        with pytest.raises(RuntimeError, match="can't start"):
+            jobs.note("lost")
+    assert not jobs.busy(LANE)
+    jobs.note("next")
+    jobs.settle()
+    assert jobs.done == ["next"]
