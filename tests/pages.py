@@ -77,7 +77,7 @@ class FrameWithoutMotion(Frame):
     level: Any = None
     goal: Any = None
     reached: Any = None
-    num_added: Any = 0
+    shaping: Any = ()
     chosen: Any = 0
     remembers: Any = False
     reason: Any = ""
@@ -92,6 +92,7 @@ def frame_of(scenario: Scenario, **changes: Any) -> Frame:
     """The last frame of a scenario, with nothing in it but what is given."""
     nothing: Any = None
     given = {"stage": Stage.CERTIFIED, "certificates": Certificates(0.01)} | changes
+    given.setdefault("shaping", np.ones(len(changes.get("rollouts", ())), bool))
     return FrameWithoutMotion(scenario, motion=nothing, drawn=nothing, **given)
 
 

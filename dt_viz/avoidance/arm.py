@@ -240,7 +240,7 @@ class WholeArm:
         Obstacles that one posture comes near to are left in one direction where their own ones are opposed: else their
         flows would hold each other up, and motions turn back between them.
         """
-        q, parts, margin = lifted.tracked.q[: lifted.num_shaping], avoidance.avoided.parts, avoidance.margin
+        q, parts, margin = lifted.tracked.q[lifted.shaping], avoidance.avoided.parts, avoidance.margin
         tangents = np.gradient(self.robot.end_effector(q), axis=1).reshape(-1, 3)
         tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
         q = q.reshape(-1, NUM_JOINTS)

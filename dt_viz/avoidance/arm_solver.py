@@ -66,19 +66,19 @@ class ArmSolution:
     clearance: float
     """Smallest distance of the arm from the obstacle along the rollouts that shape the flow, metres; only where it is
     near, else less."""
-    stuck: Indices
-    """Hosts that do not keep the clearance that is asked for."""
-    too_near: Indices
-    """Guests, counted among all rollouts, that do not keep it."""
-    moved: Indices
-    """Guests that begin more than `MOVED` away from their start."""
+    stuck: Mask
+    """(R,) rollouts that shape the flow and do not keep the clearance that is asked for."""
+    too_near: Mask
+    """(R,) other rollouts that do not keep it."""
+    moved: Mask
+    """(R,) other rollouts that begin more than `MOVED` away from their start."""
     detours: tuple[Detour | None, ...] = ()
     """Detour around each obstacle; None for those that are not in the way, empty where none is."""
 
     @property
     def cleared(self) -> bool:
         """Whether all rollouts that shape the flow keep the clearance that is asked for."""
-        return not len(self.stuck)
+        return not self.stuck.any()
 
     @property
     def soon(self) -> bool:
@@ -118,7 +118,7 @@ class Solver:
         if self._generator is None:
             duration = 0.0
         elif duration is None:
-            shaping = self._lifted.tracked.q[: self._lifted.num_shaping]
+            shaping = self._lifted.tracked.q[self._lifted.shaping]
             q = self._limits.inside(shaping[:, ::STRIDE].reshape(-1, NUM_JOINTS))
             duration = self._clearing_duration(q[self._lack(q) > 0])
         return self._with_duration(min(max(duration, self._shortest), self._longest))
@@ -159,20 +159,21 @@ class Solver:
         p = bundle.positions / LEVERS
         shaping, near = self._shaping(bundle), asked - kept > ROUNDING
         q = self._lifted.at(bundle.index, bundle.fraction)
-        stuck, too_near = (np.unique(bundle.index[near & which]) for which in (shaping, ~shaping))
         away = np.linalg.norm(self._robot.end_effector(p) - self._robot.end_effector(q), axis=1) > MOVED
-        moved = np.unique(bundle.index[away & ~shaping & (bundle.fraction == 0)])
+        samples = near & shaping, near & ~shaping, away & ~shaping & (bundle.fraction == 0)
+        rollouts = np.arange(len(self._lifted.fractions))
+        stuck, too_near, moved = (np.isin(rollouts, bundle.index[which]) for which in samples)
         return ArmSolution(
             transform, bundle.index, bundle.fraction, q, p, duration, float(kept[shaping].min()), stuck, too_near, moved
         )
 
     def _shaping(self, bundle: Bundle) -> Mask:
-        return bundle.index < self._lifted.num_shaping
+        return self._lifted.shaping[bundle.index]
 
     def _sampled(self, transform: Diffeomorphism) -> Bundle:
-        num_rollouts, num_samples = self._lifted.fractions.shape
+        rollouts, num_samples = np.flatnonzero(self._lifted.moving), self._lifted.fractions.shape[1]
         first = np.linspace(0, num_samples - 1, NUM_COARSE if self._coarse else num_samples).round().astype(int)
-        index, fraction = np.repeat(np.arange(num_rollouts), len(first)), self._lifted.fractions[:, first].ravel()
+        index, fraction = np.repeat(rollouts, len(first)), self._lifted.fractions[rollouts][:, first].ravel()
         return self._refined(Bundle(index, fraction, self._evaluate(transform, index, fraction)), transform)
 
     def _transform(self, duration: float) -> Diffeomorphism:

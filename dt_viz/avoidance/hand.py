@@ -13,7 +13,8 @@ from dt_viz.avoidance.avoidance import Avoidance
 from dt_viz.avoidance.clearing import clearing_duration, escape_lengths
 from dt_viz.avoidance.detour import Detour, DetourSettings, remembered
 from dt_viz.avoidance.sideways import Encounter, fixing_ends
-from dt_viz.avoidance.transform import Aside, Built, MotionBelow, axes_of, start_warnings
+from dt_viz.avoidance.start_status import start_warnings
+from dt_viz.avoidance.transform import Aside, Built, MotionBelow, axes_of
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain, Diffeomorphism
 from dt_viz.flows.fields import Array, Mask, Projected, VectorField
 from dt_viz.flows.integrators import integrate_adaptive
@@ -104,9 +105,9 @@ class HandAvoidance(Avoidance, space="task"):
             motion = replace(
                 motion, positions=Chain([fixing_ends(first, last) for first in aside]).inverse(motion.positions)
             )
-        num_demonstrated = len(motion.demonstrated.starts)
-        covered = np.flatnonzero(_blocked(obstacle, motion))
-        warnings = start_warnings(covered, num_demonstrated, Kind.START_COVERED, "inside the obstacle", motion.name)
+        covered = _blocked(obstacle, motion)
+        added = np.zeros(len(covered), bool) if motion.shaping is None else ~motion.shaping
+        warnings = [*start_warnings(covered, added, Kind.START_COVERED, "inside the obstacle", motion.name)]
         duration, hopeless = None if self.duration is None else self.duration - spent, False
         if duration is None:
             # the deepest samples leave last, or nearly so; if they were not enough at the last attempt, take all

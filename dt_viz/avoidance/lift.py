@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from dt_viz.flows.fields import Array, Indices
+from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.kernels.splines import cubics
 from dt_viz.robot.inverse_kinematics import TrackedPath, track
 from dt_viz.robot.robot import NUM_JOINTS, Robot
@@ -27,16 +29,13 @@ class Lift:
     """Joints at these fractions; its q has shape (R, T, 6)."""
     reference: Array
     """(6,) posture that the arm stays near to, rad."""
+    moving: Mask
+    """(R,) rollouts that the arm moves along."""
+    shaping: Mask
+    """(R,) those of them that an avoidance is made for."""
     exactly: Callable[[Array, Indices, Array], Array] | None = None
     """Takes postures (N, 6) between the fractions onto the motion that they follow, of these rollouts (N,) at these
     fractions (N,); None is content with the spline."""
-    num_added: int = 0
-    """Number of the rollouts, the last ones, from added starts: the avoidance is not made for these."""
-
-    @property
-    def num_shaping(self) -> int:
-        """Number of the rollouts, the first ones, that an avoidance is made for."""
-        return len(self.fractions) - self.num_added
 
     @cached_property
     def _splines(self) -> tuple[Array, Array]:
@@ -53,27 +52,26 @@ class Lift:
         q = d[piece] + u * (c[piece] + u * (b[piece] + u * a[piece]))
         return q if self.exactly is None else self.exactly(q, index, fraction)
 
-    def only(self, rollout: int) -> Lift:
-        """One of the rollouts."""
-        q, error, limits_hit, manipulability, damped = (
-            getattr(self.tracked, name)[rollout : rollout + 1] for name in TrackedPath.__dataclass_fields__
-        )
-        tracked = TrackedPath(q, error, limits_hit, manipulability, damped)
-        return Lift(self.fractions[rollout : rollout + 1], tracked, self.reference)
+    def along(self, rollout: int) -> TrackedPath:
+        """The joints along one of the rollouts: its q has shape (T, 6)."""
+        return TrackedPath(*(values[rollout] for values in _fields(self.tracked)))
 
     @cached_property
     def pins(self) -> Array:
         """(R' + 1, 6) postures at the starts of the R' rollouts that shape the flow, and at the goal, rad."""
-        return np.concatenate([self.tracked.q[: self.num_shaping, 0], self.tracked.q[:1, -1]])
+        q = self.tracked.q[self.shaping]
+        return np.concatenate([q[:, 0], q[:1, -1]])
+
+    @classmethod
+    def of(cls, lifts: Sequence[Lift], moving: Mask, shaping: Mask) -> Lift:
+        """The rollouts of several, one after the other, with the reference of the first."""
+        tracked = zip(*(_fields(part.tracked) for part in lifts), strict=True)
+        fractions = np.concatenate([part.fractions for part in lifts])
+        return cls(fractions, TrackedPath(*map(np.concatenate, tracked)), lifts[0].reference, moving, shaping)
 
 
-def joined(lifts: Sequence[Lift], num_added: int) -> Lift:
-    """The rollouts of several, one after the other, those from added starts last, with the reference of the first."""
-    tracked = TrackedPath(
-        *(np.concatenate([getattr(part.tracked, name) for part in lifts]) for name in TrackedPath.__dataclass_fields__)
-    )
-    fractions = np.concatenate([part.fractions for part in lifts])
-    return Lift(fractions, tracked, lifts[0].reference, num_added=num_added)
+def _fields(tracked: TrackedPath) -> tuple[NDArray[Any], ...]:
+    return tracked.q, tracked.error, tracked.limits_hit, tracked.manipulability, tracked.damped
 
 
 def lift(robot: Robot, fractions: Array, paths: Array, reference: Array, initial: Array | None = None) -> Lift:
@@ -86,5 +84,5 @@ def lift(robot: Robot, fractions: Array, paths: Array, reference: Array, initial
         reference: (6,) posture that the arm stays near to, rad.
         initial: (R, T, 6) joints of nearby paths to begin from, rad.
     """
-    start = np.broadcast_to(reference, (len(paths), NUM_JOINTS))
-    return Lift(fractions, track(robot, paths, start, initial, reference=start), reference)
+    start, every = np.broadcast_to(reference, (len(paths), NUM_JOINTS)), np.ones(len(paths), bool)
+    return Lift(fractions, track(robot, paths, start, initial, reference=start), reference, every, every)

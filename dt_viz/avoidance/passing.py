@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from dt_viz.avoidance.detour import Detour, remembered, travel
+from dt_viz.avoidance.start_status import StartStatus
 from dt_viz.obstacles.shapes import Obstacle
 
 Stance = tuple[float, float, float, float, float, float]
@@ -26,8 +27,8 @@ class Passing:
     """Whether that flow clears the obstacles."""
     stance: Stance | None = None
     """Stance of the arm; None is its usual one."""
-    left_out: tuple[int, ...] = ()
-    """Numbers of the starts that have no motion."""
+    status: tuple[StartStatus, ...] = ()
+    """Status of each start, in the order of the scenario."""
 
     def goes_on(self, obstacles: Sequence[Obstacle]) -> bool:
         """Return whether an obstacle that the whole arm passed is still there, or nearby."""

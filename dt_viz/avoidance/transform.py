@@ -15,7 +15,7 @@ import numpy as np
 
 from dt_viz.avoidance.detour import Detour
 from dt_viz.flows.diffeomorphisms import AUTO, AdaptiveFlow, Diffeomorphism, Flow, Integration
-from dt_viz.flows.fields import Array, Indices
+from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.obstacles.shapes import Point
 from dt_viz.obstacles.union import Union
 from dt_viz.warning import Kind, MotionWarning
@@ -50,8 +50,8 @@ class MotionBelow:
     """(N, 3) the same samples at the top of the stack, where the robot moves, metres; None before it is built."""
     keeps_goal: bool = True
     """Whether transforms that are not meant to move the goal must keep it."""
-    num_demonstrated: int | None = None
-    """Number of rollouts, the first ones, that have a demonstration; None is all. The others begin anywhere."""
+    shaping: Mask | None = None
+    """(R,) rollouts that the transform is made for; None is all. The others are carried along."""
     targets: tuple[Point, ...] = ()
     """Places that transforms further down lead the motions to, metres."""
     detours: tuple[Detour | None, ...] = ()
@@ -66,14 +66,14 @@ class MotionBelow:
 
     @property
     def demonstrated(self) -> MotionBelow:
-        """The motion without rollouts that have no demonstration."""
-        num = self.num_demonstrated
-        if num is None or num == len(self.starts):
+        """The motion without rollouts that the transform is not made for."""
+        shaping = self.shaping
+        if shaping is None or shaping.all():
             return self
-        rows = slice(np.searchsorted(self.index, num))
-        top = None if self.top is None else self.top[rows]
-        samples = {"index": self.index[rows], "positions": self.positions[rows], "top": top}
-        return replace(self, starts=self.starts[:num], **samples)
+        rows = shaping[self.index]
+        index, top = np.cumsum(shaping)[self.index[rows]] - 1, None if self.top is None else self.top[rows]
+        samples = {"index": index, "positions": self.positions[rows], "top": top}
+        return replace(self, starts=self.starts[shaping], shaping=None, **samples)
 
     def warning(self, kind: Kind, text: str) -> MotionWarning:
         """Return a warning about the transform that changes this motion."""
@@ -273,16 +273,3 @@ class Transform(ABC):
     def beside(cls: type[_Transform], surroundings: Surroundings) -> _Transform:
         """Return the transform that the page adds."""
         return cls()
-
-
-def start_warnings(
-    which: Indices, num_demonstrated: int, kind: Kind, how: str, source: str = ""
-) -> list[MotionWarning]:
-    """Return warnings that the starts `which`, counted from 0, the task's first, are `how`; empty without any."""
-    said = []
-    for numbers, of in ((which[which < num_demonstrated], ""), (which[which >= num_demonstrated], "added ")):
-        counted = ", ".join(str(k + 1 - (num_demonstrated if of else 0)) for k in numbers)
-        if len(numbers):
-            which_are = f"{of}start {counted} is" if len(numbers) == 1 else f"{of}starts {counted} are"
-            said.append(MotionWarning(kind, f"{which_are} {how}", source))
-    return said

@@ -26,10 +26,10 @@ class _AlonePlanner:
 
     def plan(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
         """Plan without regard to the obstacle; see `Planner`."""
-        nominal, numbers = from_starts(self.learned, starts)
+        nominal, places = from_starts(self.learned, starts)
         bundle = nominal.bundle
         times = bundle.split(nominal.rays.times(bundle.index, bundle.fraction))
-        return Plan(tuple(nominal.paths[k] for k in numbers), tuple(times[k] for k in numbers))
+        return Plan(tuple(nominal.paths[place] for place in places), tuple(times[place] for place in places))
 
 
 class OursAlone(Method):
@@ -57,20 +57,20 @@ class _WholeArmPlanner:
         Raises:
             UnreachableError: the arm cannot get to where the task's motions start.
         """
-        nominal, numbers = from_starts(self.learned, starts)
+        nominal, places = from_starts(self.learned, starts)
         moving = self._moving(nominal, obstacle)
-        motions = [moving[k] if k in moving else self._resting(nominal, k) for k in numbers]
+        motions = [moving[place] if place in moving else self._resting(nominal, place) for place in places]
         end_effector = self.follower.robot.end_effector
         return Plan(
             tuple(end_effector(q) for q, _ in motions), tuple(t for _, t in motions), tuple(q for q, _ in motions)
         )
 
-    def _resting(self, nominal: Nominal, number: int) -> tuple[Array, Array]:
+    def _resting(self, nominal: Nominal, place: int) -> tuple[Array, Array]:
         """The posture (1, 6), rad, at the start of a rollout, at time 0 (1,)."""
-        return self.follower.undisturbed_along(nominal, number).tracked.q[0, :1], np.zeros(1)
+        return self.follower.undisturbed(nominal).tracked.q[place, :1], np.zeros(1)
 
     def _moving(self, nominal: Nominal, obstacle: Union) -> dict[int, tuple[Array, Array]]:
-        """Joints (N, 6), rad, and times (N,), s, of the rollouts that the arm finds a way for, by their number."""
+        """Joints (N, 6), rad, and times (N,), s, of the rollouts that the arm finds a way for, by their place."""
         avoidance = ArmAvoidance(obstacle.parts)
         admission = self.follower.admission(nominal, avoidance)
         if admission.blocked:
@@ -81,10 +81,9 @@ class _WholeArmPlanner:
         if solved.blocked or arm is None:
             return {}
         due, limits = solved.stack.rays.times(arm.index, arm.fraction), self.follower.robot.velocity_limits
-        rows = [arm.index == rollout for rollout in range(len(solved.nominal.trajectories))]
+        rows = {place: arm.index == place for place in np.flatnonzero(solved.nominal.moving).tolist()}
         return {
-            number: (arm.p[row], within_velocity_limits(due[row], arm.p[row], limits))
-            for number, row in zip(solved.nominal.numbers, rows, strict=True)
+            place: (arm.p[row], within_velocity_limits(due[row], arm.p[row], limits)) for place, row in rows.items()
         }
 
 
@@ -105,12 +104,12 @@ class Ours(Method):
 
 
 def from_starts(learned: Learned, starts: Array) -> tuple[Nominal, list[int]]:
-    """The undisturbed motion from starts (R, 3), metres, and the number of each start's rollout in it.
+    """The undisturbed motion from starts (R, 3), metres, and the place of each start in it.
 
     The task's starts are always part of it: the whole arm's avoidance is made for their motions.
     """
-    known = {as_point(start): number for number, start in enumerate(learned.task.starts)}
+    known = {as_point(start): place for place, start in enumerate(learned.task.starts)}
     points = [as_point(start) for start in starts]
     added = list(dict.fromkeys(point for point in points if point not in known))
-    numbers = {**known, **{point: len(learned.task.starts) + k for k, point in enumerate(added)}}
-    return learned.nominal([learned.trajectory(Start(point)) for point in added]), [numbers[point] for point in points]
+    places = {**known, **{point: len(learned.task.starts) + k for k, point in enumerate(added)}}
+    return learned.nominal([learned.trajectory(Start(point)) for point in added]), [places[point] for point in points]

@@ -212,10 +212,11 @@ def _measured(engine: Engine, task: Task, obstacles: Sequence[Obstacle], options
     if scenario.arm_avoidance is None:
         paths, without = _finely(solved.stack), solved.nominal.paths
     else:
-        paths = [robot.end_effector(motion.q) for motion in motions]
-        without = [robot.end_effector(motion.without) for motion in motions]
+        paths = {i: robot.end_effector(motion.q) for i, motion in motions.items()}
+        without = {i: robot.end_effector(motion.without) for i, motion in motions.items()}
     rollouts, rounding = {}, 1e-9
-    for i, path, undisturbed, motion in zip(solved.nominal.numbers, paths, without, motions, strict=True):
+    for i, motion in motions.items():
+        path, undisturbed = paths[i], without[i]
         outside = (motion.q < robot.lower - rounding) | (motion.q > robot.upper + rounding)
         rollouts[i] = Rollout(
             hand=_clearance(path, obstacle),
@@ -229,8 +230,7 @@ def _measured(engine: Engine, task: Task, obstacles: Sequence[Obstacle], options
             num_outside=int(outside.any(axis=1).sum()),
             goal_miss=float(np.linalg.norm(path[-1] - frame.goal)),
         )
-    by_start = dict(zip(solved.nominal.numbers, motions, strict=True))
-    return Place(obstacle, avoidance, ends, rollouts, by_start, (), frame.certificates.warnings)
+    return Place(obstacle, avoidance, ends, rollouts, motions, (), frame.certificates.warnings)
 
 
 def _clearance(path: Array, obstacle: Union) -> float:

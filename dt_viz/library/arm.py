@@ -86,7 +86,7 @@ class Arm:
         solved = solve(scenario, admission.nominal, replace(FINE, spacing=spacing), self._follower)
         arm = solved.arm
         assert arm is not None
-        if solved.nominal.left_out or not arm.cleared:
+        if not (solved.nominal.moving.all() and arm.cleared):
             raise BlockedError("the arm finds no way around the obstacle")
         due = solved.stack.rays.times(arm.index, arm.fraction)
         away = self.robot.end_effector(arm.p) - solved.stack.positions_at(arm.index, arm.fraction)

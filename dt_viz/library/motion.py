@@ -177,7 +177,7 @@ class Motion:
         solved = Solved(scenario, nominal, nominal, solution, None, None)
         bundle, path = solution.bundle, solution.bundle.positions
         times = solution.rays.times(bundle.index, bundle.fraction)
-        drawn = DrawnSamples(bundle.index, bundle.fraction, times, path)
+        drawn = DrawnSamples(bundle.index, bundle.fraction, times, path, len(nominal.status))
         clearance = float(scenario.obstacle.signed_distance(path).min())
         return certified(Certificates(clearance, found=motion_warnings(solved, drawn)), solution, drawn)
 

@@ -82,14 +82,16 @@ class DrawnSamples:
     """(N,) when it is said to be there, seconds."""
     positions: Array
     """(N, 3), metres."""
+    num: int
+    """R, the number of rollouts; those that are not shown have no samples."""
 
     def split(self, values: Array) -> tuple[Array, ...]:
-        """Cut an array (N, …) that belongs to the samples into one array for each motion."""
-        return tuple(np.split(values, np.flatnonzero(np.diff(self.index)) + 1))
+        """Cut an array (N, …) that belongs to the samples into one array for each rollout."""
+        return tuple(np.split(values, np.searchsorted(self.index, np.arange(1, self.num))))
 
     @cached_property
     def paths(self) -> tuple[Array, ...]:
-        """Positions of each motion, (T_i, 3), metres."""
+        """Positions of each rollout, (T_i, 3), metres."""
         return self.split(self.positions)
 
 

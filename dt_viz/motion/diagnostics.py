@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
 
 import numpy as np
 
 from dt_viz.avoidance.arm_field import LEVERS
-from dt_viz.avoidance.transform import MotionBelow, start_warnings
+from dt_viz.avoidance.start_status import StartStatus, start_warnings
+from dt_viz.avoidance.transform import MotionBelow
 from dt_viz.flows.diffeomorphisms import Chain, Conjugated, Diffeomorphism, Flow, Integration
 from dt_viz.flows.fields import Array
 from dt_viz.flows.rollouts import MAX_SAMPLES, Bundle
@@ -68,12 +69,10 @@ def _of_arm(solved: Solved) -> list[MotionWarning]:
             else "a motion of the arm comes too near to the obstacle at this flow time"
         )
         warnings.append(MotionWarning(Kind.ARM_BLOCKED, text, WHOLE_ARM))
-    numbers, num = np.array(nominal.numbers), nominal.num_demonstrated
-    how = "without a way around the obstacle for the arm"
-    warnings += start_warnings(numbers[arm.too_near], num, Kind.ARM_BLOCKED, how, WHOLE_ARM)
-    beside = np.setdiff1d(arm.moved, arm.too_near)
+    warnings += start_warnings(arm.too_near, nominal.added, Kind.ARM_BLOCKED, StartStatus.NO_WAY.value, WHOLE_ARM)
     how = "so near to the obstacle that the arm begins elsewhere"
-    return warnings + start_warnings(numbers[beside], num, Kind.START_COVERED, how, WHOLE_ARM)
+    beside = arm.moved & ~arm.too_near
+    return [*warnings, *start_warnings(beside, nominal.added, Kind.START_COVERED, how, WHOLE_ARM)]
 
 
 def anchor_warnings(stack: Solution) -> tuple[MotionWarning, ...]:
@@ -91,7 +90,7 @@ def anchor_warnings(stack: Solution) -> tuple[MotionWarning, ...]:
 def _top(solved: Solved, applied: Applied, drawn: DrawnSamples | Bundle) -> MotionBelow:
     """Samples of the whole stack's motions, as a transform of the stack is asked about them."""
     nominal, samples = solved.nominal, (drawn.index, drawn.positions)
-    told = {"name": applied.name, "num_demonstrated": nominal.num_shaping}
+    told = {"name": applied.name, "shaping": nominal.shaping}
     return MotionBelow(nominal.starts, nominal.goal, *samples, **told)
 
 
@@ -108,22 +107,19 @@ def target_warnings(solved: Solved, drawn: DrawnSamples) -> tuple[MotionWarning,
     )
 
 
-def margin_warnings(
-    scenario: Scenario, nearest: Sequence[Nearest], numbers: Sequence[int]
-) -> tuple[MotionWarning, ...]:
+def margin_warnings(scenario: Scenario, nearest: Mapping[int, Nearest]) -> tuple[MotionWarning, ...]:
     """Warnings where the arm's meshes keep less than the margin that was asked for.
 
     Args:
         scenario: whose margin it is.
-        nearest: of each motion that the whole arm avoids with.
-        numbers: of the starts of these motions, counted from 0.
+        nearest: of each motion that the whole arm avoids with, by its place.
     """
-    kept, avoidance = min(nearest, key=lambda near: near.distance), scenario.arm_avoidance
+    place, kept = min(nearest.items(), key=lambda item: item[1].distance)
+    avoidance = scenario.arm_avoidance
     asks = avoidance is not None and scenario.warp == 1 and avoidance.duration is None
     if avoidance is None or not asks or kept.distance >= avoidance.margin - MARGIN_TOLERANCE:
         return ()
-    number = numbers[nearest.index(kept)]
-    where, asked = f"on rollout {number + 1} the arm's {kept.links[0]}", in_millimetres(avoidance.margin)
+    where, asked = f"on rollout {place + 1} the arm's {kept.links[0]}", in_millimetres(avoidance.margin)
     if kept.distance < 0:
         text = f"{where} enters the obstacle by {-1e3 * kept.distance:.0f} mm; a margin of {asked} was asked for"
         return (MotionWarning(Kind.ROLLOUT_ENTERS, text, ARM),)

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
 from dt_viz.avoidance.arm import WholeArm
 from dt_viz.avoidance.avoidance import ArmAvoidance
-from dt_viz.avoidance.lift import NUM_CONFIGURATIONS, Lift, joined, lift
+from dt_viz.avoidance.lift import NUM_CONFIGURATIONS, Lift, lift
 from dt_viz.avoidance.passing import Stance
 from dt_viz.avoidance.postures import Stances, stances
-from dt_viz.avoidance.transform import start_warnings
+from dt_viz.avoidance.start_status import StartStatus, start_warnings
 from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.memo import Memo
 from dt_viz.metrics import arc_length
@@ -89,29 +88,26 @@ class Follower:
         Raises:
             UnreachableError: the arm cannot get to where the motions start.
         """
-        if nominal is nominal.learned.demonstrated:
-            return self._demonstrated(nominal.learned)
-        rollouts = range(len(nominal.trajectories))
-        return self._memo(
-            "joined",
-            nominal,
-            lambda: joined([self.undisturbed_along(nominal, rollout) for rollout in rollouts], nominal.num_added),
-            newest=4,
-        )
+        own = self._demonstrated(nominal.learned, nominal.stance)
+        if nominal.shaping.all():
+            return own
 
-    def undisturbed_along(self, nominal: Nominal, rollout: int) -> Lift:
-        """The joints along one of the rollouts without any behaviour.
+        def joined() -> Lift:
+            added = nominal.trajectories[len(own.fractions) :]
+            lifts = [own, *(self._added(trajectory, own.reference) for trajectory in added)]
+            return Lift.of(lifts, nominal.moving, nominal.shaping)
 
-        Raises:
-            UnreachableError: the arm cannot get to where the task's motions start.
-        """
-        number, trajectory, stance = nominal.numbers[rollout], nominal.trajectories[rollout], nominal.stance
-        if number < nominal.num_demonstrated:
-            return self._demonstrated(nominal.learned, stance).only(number)
-        reference = self.reference(nominal)
-        # a start that is dragged leaves nothing behind
-        make = partial(_lift_added, self.robot, trajectory, reference)
-        return self._memo("added", (trajectory, stance), make, newest=NEWEST)
+        return self._memo("undisturbed", nominal, joined, newest=8)
+
+    def _added(self, trajectory: NominalTrajectory, reference: Array) -> Lift:
+        """The joints along a rollout from an added start; one that is dragged leaves nothing behind."""
+
+        def lifted() -> Lift:
+            path, fraction = trajectory.positions, trajectory.fraction
+            keep = np.linspace(0, len(fraction) - 1, NUM_CONFIGURATIONS).round().astype(int)
+            return lift(self.robot, fraction[None, keep], path[None, keep], reference)
+
+        return self._memo("added", (trajectory, reference.tobytes()), lifted, newest=NEWEST)
 
     def reference(self, nominal: Nominal) -> Array:
         """The posture (6,), rad, that the arm stays near to.
@@ -140,9 +136,11 @@ class Follower:
         if exact:
             index = np.repeat(np.arange(len(fraction)), NUM_CONFIGURATIONS)
             paths = solution.positions_at(index, fraction.ravel()).reshape(paths.shape)
+        paths[~nominal.moving] = nominal.goal  # what has no motion makes no difference to how the others are followed
         reference = self.reference(nominal)
         initial = None if exact else self.undisturbed(nominal).tracked.q  # near enough to begin from
-        lifted = replace(lift(self.robot, fraction, paths, reference, initial), num_added=nominal.num_added)
+        lifted = lift(self.robot, fraction, paths, reference, initial)
+        lifted = replace(lifted, moving=nominal.moving, shaping=nominal.shaping)
         if not exact:
             return lifted
 
@@ -182,7 +180,7 @@ class Follower:
         for stance, others in ranked:
             if not (others >= free).all():
                 return
-            yield self._standing(nominal, stance)
+            yield replace(nominal, stance=stance)
 
     def _admission(
         self, nominal: Nominal, obstacle: Union, margin: float, last: Stance | None, keeps: bool
@@ -195,14 +193,12 @@ class Follower:
             text = "the goal is inside the obstacle: the arm there touches it"
             return Admission(nominal, (MotionWarning(Kind.GOAL_COVERED, text, ARM),))
         if not free[:-1].any():
-            return Admission(nominal, tuple(_touching_starts(np.arange(len(free) - 1), len(free) - 1)))
-        return Admission(self.admitted(self._standing(nominal, stance), obstacle, ~free[:-1]))
-
-    def _standing(self, nominal: Nominal, stance: Stance | None) -> Nominal:
-        """The same motions in another stance."""
-        if stance == nominal.stance:
-            return nominal
-        return self._memo("standing", (nominal, stance), lambda: replace(nominal, stance=stance), newest=8)
+            return Admission(nominal, nominal.without(~nominal.added, StartStatus.IN_COLLISION).warnings)
+        standing = replace(nominal, stance=stance)
+        touches = self.whole_arm.clearance(self.undisturbed(standing).tracked.q[:, 0], obstacle, 0.0) < 0
+        touches[~nominal.added] = ~free[:-1]
+        standing = standing.without(self.out_of_reach(standing), StartStatus.OUT_OF_REACH)
+        return Admission(standing.without(touches, StartStatus.IN_COLLISION))
 
     def _unreached(self, learned: Learned) -> tuple[MotionWarning, ...]:
         """Warnings about the task's starts and goal that are out of the arm's reach."""
@@ -211,7 +207,7 @@ class Follower:
         except UnreachableError as error:
             return (unreachable(error),)
         missed = lifted.tracked.error[:, [0, -1]] > MAX_TRACKING_ERROR
-        reasons = far_starts(np.flatnonzero(missed[:, 0]), len(missed))
+        reasons = [*far_starts(missed[:, 0], np.zeros(len(missed), bool))]
         if missed[:, 1].any():
             reasons.append(MotionWarning(Kind.OUT_OF_REACH, "the goal is out of the arm's reach", ARM))
         return tuple(reasons)
@@ -289,57 +285,20 @@ class Follower:
         return self._shared("sound", (learned, stance), sound)
 
     def out_of_reach(self, nominal: Nominal) -> Mask:
-        """(R,) bool: which rollouts begin at an added start that the arm cannot get to.
+        """(R,) added starts that the arm cannot get to.
 
         Raises:
             UnreachableError: the arm cannot get to where the task's motions start.
         """
-        reference = self.reference(nominal)
+        return nominal.added & (self.undisturbed(nominal).tracked.error[:, 0] > MAX_TRACKING_ERROR)
 
-        def reached(trajectory: NominalTrajectory) -> bool:
-            tracked = track(self.robot, trajectory.start[None], reference)
-            return bool(tracked.error[0] <= MAX_TRACKING_ERROR)
-
-        def far(number: int, trajectory: NominalTrajectory) -> bool:
-            if number < nominal.num_demonstrated:
-                return False
-            return not self._memo("reached", (trajectory, nominal.stance), lambda: reached(trajectory), newest=NEWEST)
-
-        return np.array([far(*numbered) for numbered in zip(nominal.numbers, nominal.trajectories, strict=True)])
-
-    def admitted(self, nominal: Nominal, obstacle: Union, touched: Mask | None = None) -> Nominal:
-        """The rollouts that the whole arm can begin: without those from starts where it is out of reach or room.
-
-        Args:
-            nominal: all rollouts.
-            obstacle: what is in the way.
-            touched: (R,) which of the task's starts have no room; None is none of them.
-
-        Raises:
-            UnreachableError: the arm cannot get to where the task's motions start.
-        """
-        num, far = nominal.num_demonstrated, self.out_of_reach(nominal)
-        touches = np.zeros_like(far)
-        if touched is not None:
-            touches[:num] = touched
-        candidates = np.flatnonzero(~far)[num:]
-        if len(candidates):
-            postures = np.stack([self.undisturbed_along(nominal, k).tracked.q[0, 0] for k in candidates])
-            touches[candidates] = self.whole_arm.clearance(postures, obstacle, 0.0) < 0
-        if not (far | touches).any():
-            return nominal
-        numbers = np.array(nominal.numbers)
-        # of the motions, not of the arm that is shown: these have none
-        warnings = far_starts(numbers[far], num, source="") + _touching_starts(numbers[touches], num)
-        return nominal.only(np.flatnonzero(~(far | touches)), warnings)
-
-    def warnings(self, joints: TrackedPath, number: int) -> tuple[MotionWarning, ...]:
-        """Why the joints along the rollout from the start of this number, counted from 0, are not to be trusted."""
+    def warnings(self, joints: TrackedPath, place: int) -> tuple[MotionWarning, ...]:
+        """Why the joints along the rollout from the start at this place are not to be trusted."""
         warnings = []
         worst = float(joints.error.max())
         if worst > MAX_TRACKING_ERROR:
             because = ", a joint is at its limit" if joints.limits_hit.any() else ""
-            text = f"the arm misses the path of rollout {number + 1} by up to {1e3 * worst:.0f} mm{because}"
+            text = f"the arm misses the path of rollout {place + 1} by up to {1e3 * worst:.0f} mm{because}"
             warnings.append(MotionWarning(Kind.PATH_MISSED, text, ARM))
         if joints.damped.any():
             text = "the arm is stretched out or folded on the way: its pseudo-inverse is damped there"
@@ -383,25 +342,15 @@ def _as_stance(posture: Array) -> Stance:
     return a, b, c, d, e, f
 
 
-def _lift_added(robot: Robot, trajectory: NominalTrajectory, reference: Array) -> Lift:
-    path, fraction = trajectory.positions, trajectory.fraction
-    keep = np.linspace(0, len(fraction) - 1, NUM_CONFIGURATIONS).round().astype(int)
-    return lift(robot, fraction[None, keep], path[None, keep], reference)
-
-
 def unreachable(error: UnreachableError) -> MotionWarning:
     """The warning that the arm cannot get to where the motions start."""
     return MotionWarning(Kind.OUT_OF_REACH, f"the arm cannot reach the starts: {error}", ARM)
 
 
-def far_starts(which: Indices, num_demonstrated: int, source: str = ARM) -> list[MotionWarning]:
-    """Warnings about starts, counted from 0, that are out of the arm's reach."""
-    return start_warnings(which, num_demonstrated, Kind.OUT_OF_REACH, "out of the arm's reach", source)
-
-
-def _touching_starts(which: Indices, num_demonstrated: int) -> list[MotionWarning]:
-    how = "inside the obstacle: the arm there touches it"
-    return start_warnings(which, num_demonstrated, Kind.START_COVERED, how)
+def far_starts(far: Mask, added: Mask) -> Iterator[MotionWarning]:
+    """Warnings that the arm cannot get to the starts `far` (R,), some of which are `added` (R,)."""
+    why = StartStatus.OUT_OF_REACH
+    return start_warnings(far, added, why.kind, why.value, ARM)
 
 
 def arm_samples(num: int) -> Indices:

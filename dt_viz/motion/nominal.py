@@ -9,12 +9,12 @@ from functools import cached_property
 import numpy as np
 
 from dt_viz.avoidance.passing import Stance
+from dt_viz.avoidance.start_status import StartStatus, start_warnings
 from dt_viz.flows.diffeomorphisms import Identity
-from dt_viz.flows.fields import Array, Indices
+from dt_viz.flows.fields import Array, Mask
 from dt_viz.flows.rollouts import Bundle, Rays, evenly_sampled
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.interface import AnyImitation
-from dt_viz.memo import Memo
 from dt_viz.scenario.scenario import Start
 from dt_viz.scenario.tasks import Task
 from dt_viz.warning import MotionWarning
@@ -63,7 +63,8 @@ class Learned:
     @cached_property
     def demonstrated(self) -> Nominal:
         """The rollouts from the task's starts."""
-        return Nominal(self, self._trajectories(self.system.base.demonstrated(self.task.starts), NUM_SAMPLES))
+        trajectories = self._trajectories(self.system.base.demonstrated(self.task.starts), NUM_SAMPLES)
+        return Nominal(self, trajectories, (StartStatus.OK,) * len(trajectories))
 
     def warped(self, fraction: float) -> Learned:
         """The same with the imitation's flows run for a fraction of their durations."""
@@ -102,7 +103,9 @@ class Learned:
 
     def nominal(self, added: Sequence[NominalTrajectory]) -> Nominal:
         """The rollouts from the task's starts and from added ones."""
-        return Nominal(self, (*self.demonstrated.trajectories, *added)) if added else self.demonstrated
+        own = self.demonstrated
+        status = own.status + (StartStatus.OK,) * len(added)
+        return replace(own, trajectories=(*own.trajectories, *added), status=status) if added else own
 
     def _trajectories(self, states: Array, num_samples: int) -> tuple[NominalTrajectory, ...]:
         images, jacobians = self.images(states)
@@ -112,17 +115,19 @@ class Learned:
         return tuple(NominalTrajectory(*part) for part in zip(*parts, strict=True))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Nominal:
-    """The motion that transforms are stacked on: the learned one, and its rollouts from some starts."""
+    """The motion that transforms are stacked on: the learned one, and its rollouts from all starts of a scenario.
+
+    A start keeps its place in the order of the scenario, the task's first, then added ones; so does all that belongs to
+    it, here and in what is made of this.
+    """
 
     learned: Learned
     trajectories: tuple[NominalTrajectory, ...]
-    """The rollouts; those from the task's starts first."""
-    left_out: tuple[int, ...] = ()
-    """Numbers of the starts, the task's first, that have no rollout here."""
-    warnings: tuple[MotionWarning, ...] = ()
-    """Why they have none."""
+    """(R) the rollouts."""
+    status: tuple[StartStatus, ...]
+    """(R) whether each start has a motion, or why it has none."""
     stance: Stance | None = None
     """Posture that the arm stays near to; None is its usual one."""
 
@@ -146,45 +151,38 @@ class Nominal:
         """(3,), metres."""
         return self.learned.goal
 
-    @property
-    def num_demonstrated(self) -> int:
-        """Number of the rollouts, the first ones, that have a demonstration."""
-        return len(self.task.demonstrations)
-
-    @property
-    def num_added(self) -> int:
-        """Number of the rollouts, the last ones, that have none."""
-        return sum(number >= self.num_demonstrated for number in self.numbers)
-
-    @property
-    def num_shaping(self) -> int:
-        """Number of the rollouts, the first ones, that begin at the task's starts: flows are made for these."""
-        return len(self.trajectories) - self.num_added
+    @cached_property
+    def moving(self) -> Mask:
+        """(R,) starts that have a motion."""
+        return np.array([status is StartStatus.OK for status in self.status])
 
     @cached_property
-    def numbers(self) -> tuple[int, ...]:
-        """Number of each rollout's start among all of the scenario's, the task's first."""
-        total = len(self.trajectories) + len(self.left_out)
-        return tuple(number for number in range(total) if number not in self.left_out)
-
-    def rollout(self, number: int) -> int | None:
-        """Index of the rollout that begins at the start of this number; None if it has none."""
-        return self.numbers.index(number) if number in self.numbers else None
-
-    def only(self, rollouts: Sequence[int] | Indices, warnings: Sequence[MotionWarning] = ()) -> Nominal:
-        """Some of the rollouts, and why the others are left out: the same ones are the same object."""
-
-        def chosen() -> Nominal:
-            kept = {self.numbers[k] for k in rollouts}
-            left_out = (*self.left_out, *(number for number in self.numbers if number not in kept))
-            trajectories = tuple(self.trajectories[k] for k in rollouts)
-            return replace(self, trajectories=trajectories, left_out=tuple(sorted(left_out)), warnings=tuple(warnings))
-
-        return self._parts("only", (tuple(rollouts), tuple(warnings)), chosen, newest=4)
+    def added(self) -> Mask:
+        """(R,) starts that are added ones: they have no demonstration."""
+        return np.arange(len(self.status)) >= len(self.task.starts)
 
     @cached_property
-    def _parts(self) -> Memo:
-        return Memo()
+    def shaping(self) -> Mask:
+        """(R,) starts whose motions transforms are made for: the task's that have one."""
+        return self.moving & ~self.added
+
+    @cached_property
+    def warnings(self) -> tuple[MotionWarning, ...]:
+        """Why starts have no motion."""
+        return tuple(
+            warning
+            for why in StartStatus
+            if why is not StartStatus.OK
+            for warning in start_warnings(
+                np.array([status is why for status in self.status]), self.added, why.kind, why.value
+            )
+        )
+
+    def without(self, which: Mask, why: StartStatus) -> Nominal:
+        """The same with a status of those of the starts `which` (R,) that had a motion."""
+        left_out = which & self.moving
+        status = tuple(why if out else before for out, before in zip(left_out, self.status, strict=True))
+        return replace(self, status=status) if left_out.any() else self
 
     def warped(self, fraction: float) -> Nominal:
         """The rollouts with the imitation's flows run for a fraction of their durations; samples keep their places."""

@@ -61,20 +61,19 @@ def profiles(motion: Solved, drawn: DrawnSamples, rollout: int, follower: Follow
     Args:
         motion: what it is a rollout of.
         drawn: its rollouts.
-        rollout: index of this one.
+        rollout: place of this one.
         follower: the arm.
     """
     nominal, arm, task, rows = motion.nominal, motion.arm, motion.nominal.task, drawn.index == rollout
-    number, obstacle = nominal.numbers[rollout], motion.scenario.obstacle
-    of_mean = number >= nominal.num_demonstrated
-    demonstration = task.mean_path if of_mean else task.paths[number]
+    obstacle, of_mean = motion.scenario.obstacle, bool(nominal.added[rollout])
+    demonstration = task.mean_path if of_mean else task.paths[rollout]
     paths, below = (drawn.positions[rows], nominal.paths[rollout]), drawn.positions[rows]
     if arm is None:
         clearances = [obstacle.signed_distance(path) for path in paths]
         depths = [maximum_collision_distance(path, obstacle.signed_distance) for path in paths]
     else:
         fraction = nominal.trajectories[rollout].fraction
-        q = follower.undisturbed_along(nominal, rollout).at(np.zeros(len(fraction), int), fraction)
+        q = follower.undisturbed(nominal).at(np.full(len(fraction), rollout), fraction)
         below = follower.robot.end_effector(arm.transform.forward(arm.p[rows]))
         clearances = [follower.whole_arm.clearance(postures, obstacle) for postures in (arm.p[rows], q)]
         depths = [-float(clearance.min()) for clearance in clearances]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 
@@ -11,8 +10,8 @@ import numpy as np
 from dt_viz.avoidance.arm_solver import ArmSolution
 from dt_viz.avoidance.lift import Lift
 from dt_viz.avoidance.passing import ANEW, Passing
-from dt_viz.avoidance.transform import start_warnings
-from dt_viz.flows.fields import Indices
+from dt_viz.avoidance.start_status import StartStatus
+from dt_viz.flows.fields import Array
 from dt_viz.motion.following import Follower
 from dt_viz.motion.nominal import Nominal
 from dt_viz.motion.stack import LIVE, Precision, Solution, build_stack
@@ -44,6 +43,11 @@ class Solved:
     """Why there is no motion to show, though its ends are free; empty where there is one."""
     passing: Passing = ANEW
     """Sides and stance of the motion, under a warp those of the full one."""
+
+    def rollouts_of(self, samples: Array) -> tuple[Array, ...]:
+        """Values (N, …) of the samples of the end effector's stack for each start; none where it has no motion."""
+        moving = zip(self.stack.bundle.split(samples), self.nominal.moving, strict=True)
+        return tuple(values if moves else values[:0] for values, moves in moving)
 
     @property
     def cleared(self) -> bool:
@@ -92,19 +96,11 @@ def _with_a_way(scenario: Scenario, nominal: Nominal, follower: Follower) -> Sol
             return tried
     if solved.cleared:
         return solved
-    others = np.setdiff1d(np.arange(len(nominal.trajectories)), solved.arm.stuck)
-    if not (others < nominal.num_shaping).any():
+    others = nominal.without(solved.arm.stuck, StartStatus.NO_WAY)
+    if not others.shaping.any():
         return solved
-    tried = _solved(scenario, _only(nominal, others), LIVE, follower)
+    tried = _solved(scenario, others, LIVE, follower)
     return tried if tried.cleared else solved
-
-
-def _only(nominal: Nominal, rollouts: Sequence[int] | Indices) -> Nominal:
-    """The motion from some of its starts, with a warning that the arm has no way from the others."""
-    without = np.delete(np.array(nominal.numbers), rollouts)
-    how = "without a way around the obstacle for the arm"
-    said = start_warnings(without, nominal.num_demonstrated, Kind.START_COVERED, how)
-    return nominal.only(rollouts, (*nominal.warnings, *said))
 
 
 def _unless_it_touches(solved: Solved) -> Solved:
@@ -116,11 +112,13 @@ def _unless_it_touches(solved: Solved) -> Solved:
 
 
 def _as_many(nominal: Nominal, passing: Passing) -> Nominal:
-    """The motion without the starts that had no way just before, if any others are left."""
-    kept = [k for k, number in enumerate(nominal.numbers) if number not in passing.left_out]
-    if len(kept) == len(nominal.numbers) or not kept or passing.stance != nominal.stance:
+    """The motion without the starts that had none just before, if any others that shape it are left."""
+    if passing.stance != nominal.stance:
         return nominal
-    return _only(nominal, kept)
+    before = dict(enumerate(passing.status))
+    had_none = [before.get(place, StartStatus.OK) is not StartStatus.OK for place in range(len(nominal.status))]
+    others = nominal.without(np.array(had_none), StartStatus.NO_WAY)
+    return others if others.shaping.any() else nominal
 
 
 def _solved(
@@ -131,7 +129,7 @@ def _solved(
     stack = build_stack(nominal, scenario.active, precision, passing)
     avoidance = scenario.arm_avoidance
     hand = {applied.place: applied.made.detours for applied in stack.built if any(applied.made.detours)}
-    passed = Passing(hand, stance=nominal.stance, left_out=nominal.left_out)
+    passed = Passing(hand, stance=nominal.stance, status=nominal.status)
     if avoidance is None:
         return Solved(scenario, nominal, nominal, stack, passing=passed)
     live = precision is LIVE

@@ -156,7 +156,7 @@ def build_stack(
                 bundle.levels[:, 0],
                 tolerance=precision.tolerance,
                 keeps_goal=keeps_goal,
-                num_demonstrated=nominal.num_shaping,
+                shaping=nominal.shaping,
                 gradual=precision is LIVE,
             )
             built = _build(layers, lowest, earlier, above, detours)

@@ -11,6 +11,7 @@ from dt_viz.flows.fields import Array
 from dt_viz.obstacles.shapes import as_point
 from dt_viz.scenario.scenario import MAX_STARTS, Scenario, Start
 from dt_viz.scenario.slices import Slice
+from dt_viz.scenario.tasks import Task
 
 INNER = 0.8
 """Part of the slice that a grid covers."""
@@ -89,22 +90,22 @@ def with_grid(scenario: Scenario, area: Slice, arm_room: Callable[[Array], Array
     return Grid(starts, blocked, far)
 
 
-def followed(scenario: Scenario, num_demonstrated: int) -> int:
-    """Return the number of the start whose rollout the arm follows, counted round: the same when starts are added."""
-    return scenario.arm_rollout % (num_demonstrated + len(scenario.starts))
+def followed(scenario: Scenario, task: Task) -> int:
+    """Return the place of the start whose rollout the arm follows, counted round: the same when starts are added."""
+    return scenario.arm_rollout % (len(task.starts) + len(scenario.starts))
 
 
-def with_label(scenario: Scenario, num_demonstrated: int, label: float | None) -> tuple[Start, ...]:
+def with_label(scenario: Scenario, task: Task, label: float | None) -> tuple[Start, ...]:
     """Return the scenario's starts with a label on the one that the arm follows; unchanged if that is demonstrated."""
-    starts, index = list(scenario.starts), followed(scenario, num_demonstrated) - num_demonstrated
+    starts, index = list(scenario.starts), followed(scenario, task) - len(task.starts)
     if index >= 0:
         starts[index] = replace(starts[index], label=label)
     return tuple(starts)
 
 
-def label_of(scenario: Scenario, num_demonstrated: int) -> float | None:
+def label_of(scenario: Scenario, task: Task) -> float | None:
     """Return the label of the added start that the arm follows, or else that of new starts."""
-    index = followed(scenario, num_demonstrated) - num_demonstrated
+    index = followed(scenario, task) - len(task.starts)
     return scenario.starts[index].label if index >= 0 else scenario.view.start_label
 
 

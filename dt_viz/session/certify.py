@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from dt_viz.avoidance.arm_field import LEVERS
 from dt_viz.metrics import maximum_collision_distance
 from dt_viz.motion.certificates import (
@@ -76,6 +78,7 @@ def with_meshes(frame: Frame) -> Certificates:
     known = replace(known, collision=report).warning(*(w for w in report.warnings if w.kind not in apart))
     if motion.arm is None or avoidance is None:
         return known
-    shaping = range(len(frame.rollouts) - frame.num_added)
-    nearest = [model.nearest_to_obstacle(motion.arm.p[motion.arm.index == k], avoidance.avoided) for k in shaping]
-    return known.warning(*margin_warnings(scenario, nearest, motion.nominal.numbers))
+    places = np.flatnonzero(motion.nominal.shaping).tolist()
+    paths = {place: motion.arm.p[motion.arm.index == place] for place in places}
+    nearest = {place: model.nearest_to_obstacle(path, avoidance.avoided) for place, path in paths.items()}
+    return known.warning(*margin_warnings(scenario, nearest))

@@ -184,8 +184,8 @@ class Comparison:
         """How deep the arm's meshes enter the obstacle along motions, metres; None where it cannot follow."""
         try:
             if known.method is OURS:
-                rollouts = range(len(frame.rollouts))
-                joints = [arm_along(frame, k, self._follower)[0].q for k in rollouts]
+                moving = np.flatnonzero(frame.motion.nominal.moving).tolist()
+                joints = [arm_along(frame, place, self._follower)[0].q for place in moving]
             else:
                 joints = [self._joints(known, learned, k) for k in range(len(known.paths))]
         except UnreachableError:
@@ -252,8 +252,9 @@ def _ours(frame: Frame) -> Compared:
     """Our motions, those from the starts of the demonstrations that have one."""
     if frame.blocked:
         return Compared(OURS, note=frame.blocked[0].text)
-    paths = frame.rollouts[: len(frame.rollouts) - frame.num_added]
-    if len(paths) < len(frame.task.starts):
+    num = len(frame.task.starts)
+    if not frame.shaping[:num].all():
         return Compared(OURS, note=f"{NO_WAY} from some starts")
+    paths = frame.rollouts[:num]
     scores = scored(paths, frame.task, frame.goal, frame.scenario.obstacle)
-    return Compared(OURS, paths, frame.times[: len(paths)], scores=scores)
+    return Compared(OURS, paths, frame.times[:num], scores=scores)

@@ -42,7 +42,7 @@ def rollouts_of(motion: Solved, robot: Robot) -> DrawnSamples:
     drawn = motion.stack.bundle if motion.arm is None else motion.arm
     positions = motion.stack.bundle.positions if motion.arm is None else robot.end_effector(motion.arm.p)
     times = motion.stack.rays.times(drawn.index, drawn.fraction)
-    return DrawnSamples(drawn.index, drawn.fraction, times, positions)
+    return DrawnSamples(drawn.index, drawn.fraction, times, positions, len(motion.nominal.status))
 
 
 def arm_along(frame: Frame, rollout: int, follower: Follower) -> tuple[ArmMotion, tuple[MotionWarning, ...]]:
@@ -54,13 +54,13 @@ def arm_along(frame: Frame, rollout: int, follower: Follower) -> tuple[ArmMotion
     motion, drawn = frame.motion, frame.drawn
     nominal, rows = motion.nominal, np.flatnonzero(drawn.index == rollout)
     if motion.arm is not None and motion.lifted is not None:
-        joints, q = motion.lifted.tracked, motion.arm.p[rows]
+        joints, q = motion.lifted.along(rollout), motion.arm.p[rows]
     else:
         rows = rows[arm_samples(len(rows))]
         joints = follower.along(nominal, drawn.positions[rows])
         q = joints.q
-    warnings = follower.warnings(joints, nominal.numbers[rollout])
-    without = follower.undisturbed_along(nominal, rollout).at(np.zeros(len(rows), int), drawn.fraction[rows])
+    warnings = follower.warnings(joints, rollout)
+    without = follower.undisturbed(nominal).at(drawn.index[rows], drawn.fraction[rows])
     return ArmMotion(within_velocity_limits(drawn.times[rows], q, follower.robot.velocity_limits), q, without), warnings
 
 
@@ -224,7 +224,8 @@ def _panel(panel: Panel, frame: Frame, book: Sketchbook, *, coarse: bool) -> Pan
         return book.generating(area, title) if panel.generator else book.imitation(area, _title(panel.level))
     if panel.generator:
         return generator_panel(title, stack.built[level - 1].made.transform, area)
-    paths, avoided = stack.bundle.split(stack.bundle.levels[:, level]), _avoided(stack.built[:level])
+    paths = tuple(path for path in frame.levels[level] if len(path))
+    avoided = _avoided(stack.built[:level])
     return system_panel(_title(panel.level), system_of(frame, level), paths, area, avoided, coarse=coarse)
 
 

@@ -201,18 +201,19 @@ class Engine:
     def _below(self, nominal: Nominal, fraction: float) -> Nominal:
         return nominal.warped(fraction)
 
-    def arm_motions(self, scenario: Scenario) -> tuple[Frame, tuple[ArmMotion, ...]]:
-        """The frame of stage FINE, without pictures, and the arm's motion along each rollout; none if it is blocked.
+    def arm_motions(self, scenario: Scenario) -> tuple[Frame, dict[int, ArmMotion]]:
+        """The frame of stage FINE, without pictures, and the arm's motions, by their places; none if it is blocked.
 
         Raises:
             DemonstrationError, ImitationError: as `frames`.
             UnreachableError: the arm cannot get to where the motions start.
         """
         frame = replace(self._rollouts(scenario, FINE), stage=Stage.FINE)
-        rollouts = () if frame.blocked else range(len(frame.rollouts))
-        found = [arm_along(frame, rollout, self.follower) for rollout in rollouts]
-        warnings = [warning for _, warnings in found for warning in warnings]
-        return replace(frame, certificates=frame.certificates.warning(*warnings)), tuple(arm for arm, _ in found)
+        places = [] if frame.blocked else np.flatnonzero(frame.motion.nominal.moving).tolist()
+        found = {place: arm_along(frame, place, self.follower) for place in places}
+        warnings = [warning for _, warnings in found.values() for warning in warnings]
+        motions = {place: arm for place, (arm, _) in found.items()}
+        return replace(frame, certificates=frame.certificates.warning(*warnings)), motions
 
     # --- frames of it ---
 
@@ -255,13 +256,13 @@ class Engine:
         """The arm's motion along the rollout that it follows, if that is wanted, and what is wrong with it."""
         nominal, rollout = frame.motion.nominal, frame.chosen
         try:
-            far = self.follower.out_of_reach(nominal)
+            far = nominal.moving & self.follower.out_of_reach(nominal)
             arm, warnings = None, ()
             if moves and rollout is not None and not far[rollout]:
                 arm, warnings = arm_along(frame, rollout, self.follower)
         except UnreachableError as error:
             return None, (unreachable(error),)
-        return arm, (*warnings, *far_starts(np.array(nominal.numbers)[far], nominal.num_demonstrated))
+        return arm, (*warnings, *far_starts(far, nominal.added))
 
     @kept(1, by=lambda frame: (frame.motion, frame.chosen))
     def _certified(self, frame: Frame) -> Certificates:

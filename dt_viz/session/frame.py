@@ -12,7 +12,7 @@ import numpy as np
 from dt_viz.avoidance.passing import Passing
 from dt_viz.baselines.base import Method
 from dt_viz.flows.diffeomorphisms import Flow
-from dt_viz.flows.fields import Array
+from dt_viz.flows.fields import Array, Mask
 from dt_viz.motion.certificates import Certificates, DrawnSamples
 from dt_viz.motion.following import ArmMotion
 from dt_viz.motion.profiles import Profiles
@@ -87,7 +87,7 @@ class Frame:
     motion: Solved
     """The scenario's motion, or where it has none the last one that its task had."""
     drawn: DrawnSamples
-    """Its rollouts: first those from the task's starts, then those from added ones."""
+    """Its rollouts, by the places of their starts: first the task's, then added ones."""
     certificates: Certificates
     blocked: tuple[MotionWarning, ...] = ()
     """Why there is no motion for this scenario."""
@@ -114,12 +114,12 @@ class Frame:
 
     @property
     def ghost(self) -> tuple[Array, ...]:
-        """Undeformed rollouts, (T_i, 3), metres."""
+        """Undeformed rollouts from all starts, (T_i, 3), metres."""
         return self.motion.nominal.paths
 
     @property
     def rollouts(self) -> tuple[Array, ...]:
-        """Rollouts of the end effector, (T_i, 3), metres."""
+        """Rollouts of the end effector from all starts, (T_i, 3), metres; empty where a start has none."""
         return self.drawn.paths
 
     @property
@@ -129,9 +129,9 @@ class Frame:
 
     @property
     def levels(self) -> tuple[tuple[Array, ...], ...]:
-        """Rollouts of the end effector on each manifold of its stack, from the imitation up, each (T_i, 3)."""
-        bundle = self.motion.stack.bundle
-        return tuple(bundle.split(level) for level in np.moveaxis(bundle.levels, 1, 0))
+        """Rollouts of the end effector on each manifold of its stack, from the imitation up, each (T_i, 3) as above."""
+        levels = self.motion.stack.bundle.levels
+        return tuple(self.motion.rollouts_of(level) for level in np.moveaxis(levels, 1, 0))
 
     @property
     def level(self) -> int | None:
@@ -149,20 +149,21 @@ class Frame:
         return self.drawn.positions[-1]
 
     @property
-    def num_added(self) -> int:
-        """Number of rollouts, the last ones, from added starts."""
-        return self.motion.nominal.num_added
+    def shaping(self) -> Mask:
+        """(R,) rollouts that shape the flow: those from the task's starts, where these have any."""
+        return self.motion.nominal.shaping
 
     @cached_property
     def chosen(self) -> int | None:
-        """Index of the rollout that the arm follows.
+        """Place of the rollout that the arm follows.
 
-        The first one where it cannot begin the one that is asked for; None where that begins at an added start.
+        The first one that there is where it cannot begin the one that is asked for; None where that is an added one.
         """
         nominal, scenario = self.motion.nominal, self.motion.scenario
-        number = followed(replace(scenario, arm_rollout=self.scenario.arm_rollout), nominal.num_demonstrated)
-        rollout = nominal.rollout(number)
-        return 0 if rollout is None and number < nominal.num_demonstrated else rollout
+        place = followed(replace(scenario, arm_rollout=self.scenario.arm_rollout), self.task)
+        if nominal.moving[place]:
+            return place
+        return None if nominal.added[place] else int(np.argmax(nominal.moving))
 
     @property
     def passing(self) -> Passing:

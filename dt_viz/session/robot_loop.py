@@ -40,8 +40,8 @@ class RoundSettings:
 class _Round:
     """Where in its round a robot is."""
 
-    number: int = 0
-    """Number of the start of this round, or of the next one while it goes there."""
+    start: int = 0
+    """Place of the start of this round, or of the next one while it goes there."""
     rested: float = 0.0
     """Time since it came to rest, seconds."""
     arrived: float = 0.0
@@ -142,31 +142,30 @@ class LiveArm:
 
         Args:
             solved: the motion; of its whole arm's avoidance only what is to be avoided counts.
-            chosen: index of the rollout whose start it is to go to when that, or the task, is another than before.
+            chosen: place of the start that it is to go to when that, or the task, is another than before.
 
         Raises:
             UnreachableError: the arm cannot get to where the motions start.
         """
         before, nominal = self._solved, solved.nominal
-        number = None if chosen is None else nominal.numbers[chosen]
-        another = before is not None and (before.nominal.task is not nominal.task or number != self._chosen)
+        another = before is not None and (before.nominal.task is not nominal.task or chosen != self._chosen)
         same = before is not None and solved.stack is before.stack and solved.scenario == before.scenario
         if same and not another:
             return
         if self._controller is None:
-            first, q = chosen or 0, self._q
+            first, q = int(np.argmax(nominal.moving)) if chosen is None else chosen, self._q
             controller = ArmController(self._follower, solved)
             if q is None:
                 q = _posture(self._follower, solved, first)
             controller.begin(q, first)
             with self._changing:
                 self._q, self._controller = q, controller
-                self._round = replace(self._round, number=nominal.numbers[first])
+                self._round = replace(self._round, start=first)
         else:
             self._controller.follow(solved)
-        self._solved, self._chosen = solved, number
-        if another and number is not None:
-            self._command("home", lambda controller: self._go_home(controller, number))
+        self._solved, self._chosen = solved, chosen
+        if another and chosen is not None:
+            self._command("home", lambda controller: self._go_home(controller, chosen))
 
     def see(self, avoidance: ArmAvoidance | None) -> None:
         """Update the obstacles that the controller keeps away from, before the motion around them is computed."""
@@ -251,11 +250,11 @@ class LiveArm:
         place = hand + self._settings.push_distance * aside / np.linalg.norm(aside)
         controller.displace(track(robot, np.linspace(hand, place, 4), q).q[-1])
 
-    def _go_home(self, controller: ArmController, number: int) -> None:
-        rollout = None if self._solved is None else self._solved.nominal.rollout(number)
-        if rollout is not None:
-            self._round = replace(self._round, number=number, rested=0.0)
-            controller.home(rollout)
+    def _go_home(self, controller: ArmController, start: int) -> None:
+        moving = [] if self._solved is None else self._solved.nominal.moving
+        if start < len(moving) and moving[start]:
+            self._round = replace(self._round, start=start, rested=0.0)
+            controller.home(start)
 
     def _go_round(self, controller: ArmController, seconds: float) -> None:
         """Set out for the next start, or from there for the goal, when the robot has rested."""
@@ -266,22 +265,23 @@ class LiveArm:
         arrives = before.arrived > 0 or (rests and not homing)
         self._round = replace(before, rested=rested, arrived=before.arrived + seconds * arrives)
         if homing and rested > settings.rest_at_start:
-            self._round = _Round(before.number)
+            self._round = _Round(before.start)
             controller.go()
         elif not homing and rested > (settings.rest if phase is Phase.RESTING else settings.rest_aside):
             self._go_home(controller, self._next_start())
 
     def _next_start(self) -> int:
-        """Number of the start after this round's that the arm can get to; the first one after the last."""
+        """Place of the start after this round's that the arm can get to; the first one after the last."""
+        last = self._round.start
         if self._solved is None:
-            return self._round.number
+            return last
         nominal = self._solved.nominal
-        reached = np.array(nominal.numbers)[~self._follower.out_of_reach(nominal)].tolist()
-        return min(reached, key=lambda number: (number <= self._round.number, number), default=self._round.number)
+        reached = np.flatnonzero(nominal.moving & ~self._follower.out_of_reach(nominal)).tolist()
+        return min(reached, key=lambda start: (start <= last, start), default=last)
 
 
 def _posture(follower: Follower, solved: Solved, rollout: int) -> Array:
     """The joint angles (6,) at the beginning of a rollout, rad."""
     if solved.arm is not None:
         return solved.arm.p[int(np.argmax(solved.arm.index == rollout))]
-    return follower.undisturbed_along(solved.nominal, rollout).tracked.q[0, 0]
+    return follower.undisturbed(solved.nominal).tracked.q[rollout, 0]

@@ -11,7 +11,7 @@ in or beyond it.
 The npz file holds for each step, drag after drag:
 
 ``rollouts`` (S, R, N, 3)
-    the end effector's rollouts by the numbers of their starts, metres; NaN for a start that is left out.
+    the end effector's rollouts from the task's starts, metres; NaN for a start that is left out.
 ``places`` (S, 3), ``drag`` (S,)
     the sphere's centre, metres, and the number of the drag.
 ``moved`` (S, R)
@@ -45,7 +45,6 @@ from dt_viz.evaluate.options import (
 )
 from dt_viz.flows.fields import Array
 from dt_viz.metrics import discrete_frechet, resample_by_arc_length
-from dt_viz.motion.stack import LIVE
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.scenario.scenario import View
 from dt_viz.scenario.tasks import Task
@@ -130,7 +129,7 @@ def paths(task: Task, options: argparse.Namespace) -> Iterator[Array]:
 def _measured(engine: Engine, task: Task, places: Array, options: argparse.Namespace) -> Drag:
     """Drag the sphere through places (S, 3), metres."""
     without = replace(avoiding(task, Avoidance()), view=View(field=False))
-    rollouts = [_by_number(next(engine.frames(without)), range(len(task.paths)), task)]
+    rollouts = [_by_start(next(engine.frames(without)), task)]
     blocked, seconds, passing = [], [], ANEW
     for place in places:
         avoidance = Avoidance(Sphere(as_point(place), options.diameter), space=SPACE[options.avoid])
@@ -142,17 +141,14 @@ def _measured(engine: Engine, task: Task, places: Array, options: argparse.Names
         passing = frame.passing
         blocked.append(bool(frame.blocked))
         seconds.append(first.seconds)
-        numbers = [] if frame.blocked else engine.solved(scenario, LIVE).nominal.numbers
-        rollouts.append(rollouts[-1] if frame.blocked else _by_number(frame, numbers, task))
+        rollouts.append(rollouts[-1] if frame.blocked else _by_start(frame, task))
     return Drag(places, np.stack(rollouts[1:]), np.array(blocked), np.array(seconds))
 
 
-def _by_number(frame: Frame, numbers: Sequence[int], task: Task) -> Array:
-    """The rollouts (R, N, 3) by the numbers of their starts, metres; NaN for starts without one."""
-    rollouts = np.full((len(task.paths), NUM_POINTS, 3), np.nan)
-    for rollout, path in zip(numbers, frame.rollouts, strict=True):
-        rollouts[rollout] = resample_by_arc_length(path, NUM_POINTS)
-    return rollouts
+def _by_start(frame: Frame, task: Task) -> Array:
+    """The rollouts (R, N, 3) from the task's starts, metres; NaN for starts without one."""
+    nothing, own = np.full((NUM_POINTS, 3), np.nan), frame.rollouts[: len(task.paths)]
+    return np.stack([resample_by_arc_length(path, NUM_POINTS) if len(path) else nothing for path in own])
 
 
 def _row(name: str, drags: Sequence[Drag], moved: Sequence[Array]) -> Row:

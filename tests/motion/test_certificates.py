@@ -50,7 +50,8 @@ def straight(*fractions):
 
 
 def as_shown(bundle):
-    return DrawnSamples(bundle.index, bundle.fraction, RAYS.times(bundle.index, bundle.fraction), bundle.positions)
+    times = RAYS.times(bundle.index, bundle.fraction)
+    return DrawnSamples(bundle.index, bundle.fraction, times, bundle.positions, len(RAYS.z0))
 
 
 SHOWN = as_shown(bundle_of(IDENTITY))

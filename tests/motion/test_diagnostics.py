@@ -148,19 +148,20 @@ def test_what_follows_from_a_cause_is_told_only_where_it_may_have_another():
 
 
 def nearest(*distances):
-    return [Nearest(distance, (f"link {k}",), 0.0) for k, distance in enumerate(distances)]
+    return {place: Nearest(distance, (f"link {place}",), 0.0) for place, distance in enumerate(distances)}
 
 
 def test_a_margin_that_the_meshes_do_not_keep_is_said_with_what_they_keep():
     scenario = avoiding("draw_s", Sphere((0.0, -0.5, 0.4)), space="cspace", margin=0.02)
-    assert margin_warnings(scenario, nearest(0.5, 0.02 - 0.9 * MARGIN_TOLERANCE), (0, 1)) == ()
-    text = "on rollout 4 the arm's link 1 keeps 13 mm from the obstacle; 20 mm were asked for"
-    found = margin_warnings(scenario, nearest(0.5, 0.0134, 0.015), (0, 3, 4))  # starts 2 and 3 are left out
+    assert margin_warnings(scenario, nearest(0.5, 0.02 - 0.9 * MARGIN_TOLERANCE)) == ()
+    text = "on rollout 4 the arm's link 3 keeps 13 mm from the obstacle; 20 mm were asked for"
+    distances = nearest(0.5, 0.001, 0.001, 0.0134, 0.015)
+    found = margin_warnings(scenario, {place: distances[place] for place in (0, 3, 4)})  # the others have no motion
     assert found == (MotionWarning(Kind.ARM_TOO_NEAR, text, ARM),)
-    (entered,) = margin_warnings(scenario, nearest(-0.0044), (0,))
+    (entered,) = margin_warnings(scenario, nearest(-0.0044))
     assert entered.kind is Kind.ROLLOUT_ENTERS and "link 0 enters the obstacle by 4 mm" in entered.text
     for asks_for_none in ({"duration": 0.3}, {"warp": 0.5}, {"avoids": False}):
-        assert margin_warnings(changed(scenario, **asks_for_none), nearest(0.001), (0,)) == ()
+        assert margin_warnings(changed(scenario, **asks_for_none), nearest(0.001)) == ()
 
 
 @pytest.mark.parametrize("kept", [pytest.param(True, marks=pytest.mark.slow), False])

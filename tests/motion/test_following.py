@@ -9,6 +9,7 @@ from scenes import changed, frame_at, kinds, starts_at
 from dt_viz.avoidance.arm_solver import LONG
 from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.avoidance.lift import NUM_CONFIGURATIONS
+from dt_viz.avoidance.start_status import StartStatus
 from dt_viz.control.arm_system import Section
 from dt_viz.errors import UnwantedError
 from dt_viz.motion.following import MAX_TRACKING_ERROR, NUM_ARM_SAMPLES, Follower
@@ -67,16 +68,16 @@ class TestAdmission:
     def test_nothing_is_in_the_way_of_what_has_to_be_avoided(self, follower, nominal, initial):
         for obstacles in (initial("push_box").obstacles, (FAR,), ()):
             admission = self.admission(follower, nominal, *obstacles)
-            assert admission.nominal is nominal and not admission.blocked  # in its usual stance, too
+            assert admission.nominal == nominal and not admission.blocked  # in its usual stance, too
 
     def test_a_covered_start_is_left_out_and_named(self, follower, nominal):
         away = np.linalg.norm(nominal.task.starts - nominal.task.starts[2], axis=1)
         admission = self.admission(follower, nominal, around(nominal.task.starts[2], 0.12))
-        assert not admission.blocked and 2 in admission.nominal.left_out
+        assert not admission.blocked and admission.nominal.status[2] is StartStatus.IN_COLLISION
         (reason,) = admission.nominal.warnings
         assert reason.kind is Kind.START_COVERED and reason.text.startswith("start") and "3" in reason.text
-        assert (away[list(admission.nominal.left_out)] < 0.15).all()
-        assert len(admission.nominal.trajectories) + len(admission.nominal.left_out) == 7
+        assert (away[~admission.nominal.moving] < 0.15).all()
+        assert len(admission.nominal.trajectories) == len(admission.nominal.status) == 7
 
     @pytest.mark.parametrize(
         ("place", "diameter", "kind", "says"),
@@ -106,7 +107,7 @@ class TestAdmission:
     def test_a_start_between_the_fingers_is_left_out(self, follower, nominal):
         ball = around(nominal.task.starts[2], 0.02)
         assert load_collision_model().obstacle_distance(follower.undisturbed(nominal).pins[2:3], ball)[0][0] > 0
-        assert 2 in self.admission(follower, nominal, ball).nominal.left_out
+        assert self.admission(follower, nominal, ball).nominal.status[2] is StartStatus.IN_COLLISION
 
     def test_demonstrations_out_of_reach_are_named(self, too_far, initial, robot):
         nominal = too_far.nominal(initial("push_box"))
@@ -138,7 +139,7 @@ class TestStance:
         nominal, avoidance = beside
         assert self.truth(follower.undisturbed(nominal).pins, avoidance).min() < 0  # so there is something to do
         found = follower.admission(nominal, avoidance)
-        assert not found.blocked and not found.nominal.left_out and found.nominal.stance is not None
+        assert not found.blocked and found.nominal.moving.all() and found.nominal.stance is not None
         assert Follower(robot).admission(nominal, avoidance).nominal.stance == found.nominal.stance
         lifted = follower.undisturbed(found.nominal)
         assert self.truth(lifted.pins, avoidance).min() >= avoidance.margin - 1e-3
@@ -214,7 +215,7 @@ class TestNoWay:
     def test_other_stances_are_tried_where_the_usual_one_has_no_way(self, lift):
         usual = lift.solved()
         assert usual.nominal is lift.nominal and usual.cleared
-        lift.spoil(lift.is_usual, stuck=np.arange(1))
+        lift.spoil(lift.is_usual, stuck=np.arange(7) == 0)
         other = lift.solved()
         assert other.cleared and other.nominal.stance is not None
         # what is asked for by hand is done as it is asked for
@@ -232,24 +233,27 @@ class TestNoWay:
 
     def test_starts_from_which_there_is_no_way_are_left_out_and_named_and_not_tried_again_in_a_drag(self, lift):
         num, tried = len(lift.nominal.trajectories), []
-        lift.spoil(lambda lifted: tried.append(lifted.num_shaping) or lifted.num_shaping == num, stuck=np.array([2]))
+        spoils = lambda lifted: tried.append(lifted.shaping.sum()) or lifted.shaping.all()  # noqa: E731
+        lift.spoil(spoils, stuck=np.arange(num) == 2)
         solved = lift.solved()
-        assert solved.arm is not None and solved.cleared and solved.nominal.left_out == (2,) and tried[0] == num
-        assert len(np.unique(solved.arm.index)) == len(solved.stack.bundle.paths) == num - 1
+        assert solved.arm is not None and solved.cleared and tried[0] == num
+        assert [status is StartStatus.NO_WAY for status in solved.nominal.status] == [k == 2 for k in range(num)]
+        np.testing.assert_array_equal(np.unique(solved.arm.index), np.flatnonzero(solved.nominal.shaping))
         (warning,) = solved.nominal.warnings
         assert warning.text == "start 3 is without a way around the obstacle for the arm"
         x, y, z = lift.scenario.obstacle.parts[0].position
         moved = changed(lift.scenario, obstacles=Sphere((x, y, z + 0.003)))
         tried.clear()
         after = lift.solved(moved, passing=solved.passing)
-        assert (after.nominal.left_out, after.nominal.warnings) == ((2,), (warning,)) and tried == []  # it is followed
+        assert after.nominal.status == solved.nominal.status and after.nominal.warnings == (warning,)
+        assert tried == []  # it is followed
         tried.clear()
         lift.solved(moved, FINE, solved.passing)
         assert tried[0] == num
 
     @pytest.mark.parametrize("precision", [LIVE, pytest.param(FINE, marks=pytest.mark.slow)], ids=["live", "fine"])
     def test_no_way_is_said_instead_of_shown_where_the_arm_would_touch(self, lift, precision):
-        lift.spoil(lambda lifted: True, stuck=np.arange(len(lift.nominal.trajectories)))
+        lift.spoil(lambda lifted: True, stuck=np.ones(len(lift.nominal.trajectories), bool))
         assert lift.solved(precision=precision).blocked == ()  # it comes near, but does not touch
         lift.go_straight_through()
         (warning,) = lift.solved(precision=precision).blocked
@@ -262,18 +266,24 @@ class TestNoWay:
         lift = Lift(engine, engine.follower, initial("lift_box"), monkeypatch)
         lift.go_straight_through()
         frame, motions = engine.arm_motions(lift.scenario)
-        assert kinds(frame.blocked) == {Kind.NO_WAY} and motions == ()
+        assert kinds(frame.blocked) == {Kind.NO_WAY} and motions == {}
         assert all(kinds(shown.blocked) == {Kind.NO_WAY} for shown in engine.frames(lift.scenario))
 
-    def test_a_start_left_out_leaves_the_arm_with_another_and_added_starts_the_last_ones(self, new_engine, initial):
+    def test_a_covered_start_leaves_the_arm_with_another_and_all_others_in_their_places(self, new_engine, initial):
         engine, added = new_engine(), ((0.1, -0.45, 0.3), (0.0, -0.45, 0.35))
         scenario = placed(initial("push_box"), around(engine.task("push_box").starts[0], 0.1))
         frame, motions = engine.arm_motions(scenario)
         assert 0 < len(motions) < 7 and Kind.START_COVERED in kinds(frame.certificates.found)
-        assert frame.chosen == 0 and len(frame.rollouts) == len(motions)
+        places = [place for place, path in enumerate(frame.rollouts) if len(path)]
+        assert frame.chosen == places[0] > 0 and list(motions) == places and len(frame.rollouts) == 7
+        for level in frame.levels:
+            assert [place for place, path in enumerate(level) if len(path)] == places
+        for place in places:
+            np.testing.assert_allclose(frame.rollouts[place][0], frame.task.starts[place], atol=5e-3)
         frame = next(engine.frames(replace(scenario, starts=starts_at(*added))))
         assert Kind.START_COVERED in kinds(frame.certificates.found)
-        assert frame.num_added == len(added) and len(frame.rollouts) == len(motions) + len(added)
+        assert [place for place, path in enumerate(frame.rollouts) if len(path)] == [*places, 7, 8]
+        np.testing.assert_array_equal(np.flatnonzero(frame.shaping), places)
         for path, start in zip(frame.rollouts[-2:], added, strict=True):
             np.testing.assert_allclose(path[0], start, atol=5e-3)
 

@@ -324,9 +324,8 @@ def test_the_8_is_drawn_as_demonstrated(engine):
 def test_certificates_recognise_motions_of_other_conditions(engine):
     solved = engine.solved(in_the_way(engine), FINE)
     stack, bundle = solved.stack, solved.stack.bundle
-    shown = DrawnSamples(
-        bundle.index, bundle.fraction, stack.rays.times(bundle.index, bundle.fraction), bundle.positions
-    )
+    times = stack.rays.times(bundle.index, bundle.fraction)
+    shown = DrawnSamples(bundle.index, bundle.fraction, times, bundle.positions, len(solved.nominal.status))
     assert not certified(Certificates(0.01), stack, shown).warnings
     another = replace(stack, rays=replace(stack.rays, z0=np.roll(stack.rays.z0, 1, axis=0)))
     assert Kind.OFF_MOTION in kinds(certified(Certificates(0.01), another, shown).warnings)

@@ -42,7 +42,7 @@ def test_a_grid_leaves_out_where_the_arm_that_is_to_avoid_the_obstacle_touches_i
     hand_only = with_grid(changed(scenario, space="task"), task.slice, no_arm)
     assert set(grid.starts) < set(hand_only.starts) and grid.num_blocked > hand_only.num_blocked
     nominal = engine.nominal(replace(scenario, starts=grid.starts))
-    assert not engine.follower.admitted(nominal, scenario.obstacle).left_out
+    assert engine.follower.admission(nominal, scenario.arm_avoidance).nominal.moving.all()
     postures = engine.follower.undisturbed(nominal).tracked.q[7:, 0]
     room = engine.follower.whole_arm.clearance(postures, scenario.obstacle)
     np.testing.assert_allclose(room, arm_room(places_of(grid.starts)), atol=1e-3)
@@ -79,9 +79,9 @@ def test_the_arm_follows_the_same_rollout_when_starts_are_added(engine, initial,
     scenario = replace(initial("draw_s"), arm_rollout=arm_rollout)
     before = next(engine.frames(scenario)).chosen
     added = with_start(scenario, np.array([0.1, -0.5, 0.4]))
-    after = replace(scenario, starts=added, arm_rollout=followed(scenario, 7))
+    after = replace(scenario, starts=added, arm_rollout=followed(scenario, engine.task("draw_s")))
     assert next(engine.frames(after)).chosen == before < 7
-    assert followed(after, 7) == before
+    assert followed(after, engine.task("draw_s")) == before
 
 
 @pytest.fixture

@@ -75,7 +75,8 @@ class ComparedMotions(Picture):
         for name, compared in shown.items():
             if name not in self.motions:
                 self.motions[name] = _DrawnMotions(self._scene, name, compared.method.title)
-            self.motions[name].show(compared, frame.rollouts[frame.chosen or 0], names, look.theme)
+            ours = next(path for path in frame.rollouts[frame.chosen or 0 :] if len(path))
+            self.motions[name].show(compared, ours, names, look.theme)
 
 
 class TheirArm:

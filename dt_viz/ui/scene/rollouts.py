@@ -55,8 +55,8 @@ class Ghost(_OutsideTubes):
         super().__init__(Lines(scene, "/ghost", STYLES.ghost))
 
     def _paths(self, frame: Frame) -> Sequence[Array]:
-        own = frame.ghost[: len(frame.ghost) - frame.num_added]
-        return own if frame.chosen is None else frame.ghost[frame.chosen : frame.chosen + 1]
+        shown = frame.shaping if frame.chosen is None else np.arange(len(frame.ghost)) == frame.chosen
+        return [path for path, is_shown in zip(frame.ghost, shown, strict=True) if is_shown]
 
 
 class Rollouts(Picture):
@@ -70,9 +70,8 @@ class Rollouts(Picture):
 
     def draw(self, frame: Frame, look: Look) -> None:
         middles, theme = look.tubes.middles, look.theme
-        number = np.arange(len(middles))
-        followed = number == (frame.chosen if frame.level is None else None)
-        added = number >= len(middles) - frame.num_added
+        places = np.array([place for place, path in enumerate(frame.rollouts) if len(path)], int)
+        followed, added = places == (frame.chosen if frame.level is None else None), ~frame.shaping[places]
         self.followed.show(middles[followed], theme)
         # thinner beside those of a level
         self.others.show(middles[~added & ~followed], theme, scale=1.0 if frame.level is None else 0.7)
@@ -92,7 +91,7 @@ class LevelRollouts(Picture):
 
     def draw(self, frame: Frame, look: Look) -> None:
         if frame.level is not None:
-            paths = frame.levels[frame.level]
+            paths = [path for path in frame.levels[frame.level] if len(path)]
             self.tubes.show(middles_of(paths), look.theme)
             self.end.position = paths[0][-1]  # marked unless it is the goal
             self.end.visible = bool(np.linalg.norm(paths[0][-1] - frame.goal) > MAX_GOAL_MISS)

@@ -53,7 +53,7 @@ class Starts(MarkerGroup[Marker]):
             return
         session = self._session()
         scenario = session.scenario
-        arm_rollout = followed(scenario, len(session.task.demonstrations))
+        arm_rollout = followed(scenario, session.task)
         session.edit("add start", starts=with_start(scenario, place), arm_rollout=arm_rollout)
         session.end_gesture()
 

@@ -126,14 +126,14 @@ class RolloutTubes:
     """Where the tubes of a frame's rollouts lie, computed once for all that is drawn beside them."""
 
     rollouts: tuple[Array, ...] = ()
-    """(T_i, 3), metres."""
+    """(T_i, 3), metres; empty ones have no tube."""
     shown: bool = True
     """Whether the tubes are shown; hidden ones cover nothing."""
 
     @cached_property
     def middles(self) -> Array:
         """Middles (R, `NUM_RINGS`, 3) of the tubes' rings, metres."""
-        return middles_of(self.rollouts)
+        return middles_of([path for path in self.rollouts if len(path)])
 
     @cached_property
     def _samples(self) -> KDTree:

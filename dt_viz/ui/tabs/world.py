@@ -263,7 +263,7 @@ def add_starts(gui: viser.GuiApi, bindings: Bindings) -> None:
         bindings.input(
             label,
             lambda s: _label_shown(s, bindings.frame),
-            lambda s, name: _labelled(s, len(bindings.session.task.demonstrations), labels().get(name)),
+            lambda s, name: _labelled(s, bindings.session.task, labels().get(name)),
         )
         acts = {"Grid": add_grid, "Remove": remove_start, "Clear": clear_starts}
         hint = "Grid: starts all over the slice. Remove: the start that the arm follows, or else the newest"
@@ -281,7 +281,7 @@ def add_grid(session: Session) -> None:
     except UnreachableError as error:
         session.say(f"the arm cannot reach the starts: {error}", Severity.WARNING)
         return
-    arm_rollout = followed(scenario, len(task.demonstrations))
+    arm_rollout = followed(scenario, task)
     session.step("grid of starts", starts=grid.starts, arm_rollout=arm_rollout)
     reasons = (
         (grid.num_blocked, "at or inside an obstacle, or the arm is there"),
@@ -294,24 +294,24 @@ def add_grid(session: Session) -> None:
 
 def remove_start(session: Session) -> None:
     """Remove the start that the arm follows, or else the newest."""
-    starts, num_demonstrated = session.scenario.starts, len(session.task.demonstrations)
+    starts, num = session.scenario.starts, len(session.task.starts)
     if starts:
-        arm_rollout = followed(session.scenario, num_demonstrated)
+        arm_rollout = followed(session.scenario, session.task)
         index = len(starts) - 1
-        if arm_rollout >= num_demonstrated:
-            index, arm_rollout = arm_rollout - num_demonstrated, 0
+        if arm_rollout >= num:
+            index, arm_rollout = arm_rollout - num, 0
         session.step("remove start", starts=(*starts[:index], *starts[index + 1 :]), arm_rollout=arm_rollout)
 
 
 def clear_starts(session: Session) -> None:
     """Remove all added starts."""
-    number = followed(session.scenario, len(session.task.demonstrations))
-    session.step("clear starts", starts=(), arm_rollout=number if number < len(session.task.demonstrations) else 0)
+    place = followed(session.scenario, session.task)
+    session.step("clear starts", starts=(), arm_rollout=place if place < len(session.task.starts) else 0)
 
 
-def _labelled(scenario: Scenario, num_demonstrated: int, label: float | None) -> dict[str, Any]:
+def _labelled(scenario: Scenario, task: Task, label: float | None) -> dict[str, Any]:
     """What changes when new starts, and the added start that the arm follows, get a label."""
-    starts = with_label(scenario, num_demonstrated, label)
+    starts = with_label(scenario, task, label)
     return {"starts": starts, "view": replace(scenario.view, start_label=label)}
 
 
@@ -327,7 +327,7 @@ def _label_shown(scenario: Scenario, frame: Frame | None) -> str:
     """The name of the label that starts of the scenario have in a frame."""
     if frame is None:
         return NEAREST
-    label = label_of(scenario, len(frame.task.demonstrations))
+    label = label_of(scenario, frame.task)
     return NEAREST if label is None or label not in frame.labels else _named(label, frame.labels)
 
 
