@@ -16,6 +16,7 @@ from dt_viz.flows.fields import Array, Mask
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.body_points import BodyPoints
+from dt_viz.robot.collision import SELF_MARGIN
 from dt_viz.robot.inverse_kinematics import loses_branch, track
 from dt_viz.robot.robot import NUM_JOINTS, Robot
 
@@ -85,11 +86,12 @@ def stances(robot: Robot, body: BodyPoints, usual: Array, starts: Array, path: A
     """Find stances for the motions of a task.
 
     Random postures are brought to the mean start, then each follows all starts and the mean motion. Those stay that do
-    so on one branch, inside the joint limits, away from singularities, and no lower than the usual one or the table.
+    so on one branch, inside the joint limits, away from singularities, no lower than the usual one or the table, and
+    with links that keep `SELF_MARGIN` from each other.
 
     Args:
         robot: the arm.
-        body: body points of the links that move.
+        body: all body points.
         usual: (6,) the posture that the arm usually stays near to, rad.
         starts: (R, 3) places where motions start, metres.
         path: (T, 3) the mean motion, metres; its end is the goal.
@@ -106,11 +108,13 @@ def stances(robot: Robot, body: BodyPoints, usual: Array, starts: Array, path: A
     places = np.concatenate([starts, path])
     paths = np.broadcast_to(places, (len(references), *places.shape))
     tracked = track(robot, paths, references, reference=references)
-    heights = (body.positions(robot, tracked.q)[..., 2] - body.radius).min(axis=(1, 2))
+    moving = body.on_moving_links.with_end_effector(robot)
+    heights = (moving.positions(robot, tracked.q)[..., 2] - moving.radius).min(axis=(1, 2))
     follows = (tracked.error < REACHED) & ~tracked.limits_hit & ~tracked.damped
     sound = follows.all(axis=1) & ~loses_branch(robot, tracked.q, paths) & (heights >= min(0.0, heights[0]))
+    sound[sound] = [body.self_clearance(robot, q, SELF_MARGIN) >= SELF_MARGIN for q in tracked.q[sound]]
     sound[0] = True
     away = np.sqrt((((tracked.q - tracked.q[0]) * LEVERS) ** 2).sum(axis=2).mean(axis=1))
     order = np.argsort(np.where(sound, away, np.inf), kind="stable")[: sound.sum()]
     at_starts, on_path = np.split(tracked.q[order], [len(starts)], axis=1)
-    return Stances(robot, body, references[order], at_starts, on_path, away[order])
+    return Stances(robot, moving, references[order], at_starts, on_path, away[order])

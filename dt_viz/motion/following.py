@@ -20,7 +20,6 @@ from dt_viz.motion.nominal import Learned, Nominal, NominalTrajectory
 from dt_viz.motion.stack import Solution
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.body_points import load_body_points
-from dt_viz.robot.collision import SELF_MARGIN, load_collision_model
 from dt_viz.robot.inverse_kinematics import TrackedPath, UnreachableError, drawn_onto, inverse_kinematics, track
 from dt_viz.robot.robot import NUM_JOINTS, Robot
 from dt_viz.scenario.scenario import MAX_STARTS
@@ -35,10 +34,8 @@ NUM_ARM_SAMPLES = 200
 """Samples of the motion that the arm shows where it follows a path of the end effector."""
 NUM_ON_PATH = 20
 """Samples of the mean motion that stances are tried on."""
-SELF_STRIDE = 5
-"""Stride of the configurations between which the distance of the arm's links from each other is searched."""
-NUM_STANCES = 32
-"""Number of stances whose joints are kept."""
+NUM_STANCES = 64
+"""Number of stances, over all tasks, whose joints are kept."""
 NEWEST = 2 * MAX_STARTS
 """Number of added starts whose joints are kept."""
 
@@ -232,30 +229,21 @@ class Follower:
         Yields:
             A stance, None for the usual one; which of the starts and the goal (R + 1,) it leaves free.
         """
-        if keeps and last is not None:
-            free = self.whole_arm.clearance(self._demonstrated(learned, last).pins, obstacle, 0.0) >= 0
-            if free[-1] and free[:-1].any():
-                yield last, free
-        room = self.whole_arm.clearance(self._demonstrated(learned).pins, obstacle, margin)
-        if last is None and ((room >= margin).all() or (keeps and room[-1] >= 0 and room[:-1].max() >= 0)):
-            yield None, room >= 0
+        room = self.whole_arm.clearance(self._demonstrated(learned, last).pins, obstacle, margin)
+        is_ample = last is None and bool((room >= margin).all())
+        if is_ample or (keeps and room[-1] >= 0 and room[:-1].max() >= 0):
+            yield last, room >= 0
         known = self.stances(learned)
         clearance = known.room(obstacle, margin)
         free, ample = clearance >= 0, clearance >= margin
+        left = ~known.alike(0) if is_ample else np.ones(len(free), bool)
         # the goal first, then as many starts as possible, then as much room as is asked for
         most = free[:, -1] * free.shape[1] + free.sum(axis=1)
-        kept = np.zeros(len(free), bool) if last is None else (known.references == last).all(axis=1)
-        left = ~known.alike(0) if last is None and ample[0].all() else np.ones(len(free), bool)
-        if kept.any() and most[kept].max() == most.max():  # the rest is looked at only where this one does not do
-            best = int(np.argmax(kept))
-            yield last, free[best]
-            left &= ~known.alike(best)
-        merit = [most, kept, ample.sum(axis=1), -known.cost(obstacle, margin)]
-        for best in np.lexsort(merit[::-1])[::-1]:
-            stance = None if best == 0 else _as_stance(known.references[best])
-            if left[best] and (stance is None or self._sound(learned, stance)):
+        kept = np.array([_as_stance(posture) == last for posture in known.references])
+        for best in np.lexsort((known.cost(obstacle, margin), -ample.sum(axis=1), ~kept, -most)):
+            if left[best]:
                 left &= ~known.alike(int(best))
-                yield stance, free[best]
+                yield None if best == 0 else _as_stance(known.references[best]), free[best]
 
     def stances(self, learned: Learned) -> Stances:
         """The stances for a task's motions; the first time it takes a second or so.
@@ -267,22 +255,8 @@ class Follower:
         return self._shared(
             "stances",
             learned,
-            lambda: stances(self.robot, self.whole_arm.body, usual, learned.task.starts, _mean(paths)),
+            lambda: stances(self.robot, self.body, usual, learned.task.starts, _mean(paths)),
         )
-
-    def _sound(self, learned: Learned, stance: Stance) -> bool:
-        """Whether the arm can follow the task's motions in a stance without coming near itself."""
-
-        def sound() -> bool:
-            lifted = self._demonstrated(learned, stance)
-            tracked = lifted.tracked
-            if (tracked.error > MAX_TRACKING_ERROR).any() or tracked.limits_hit.any() or tracked.damped.any():
-                return False
-            paths = tracked.q[0, ::SELF_STRIDE], lifted.pins[:-1]
-            nearest = [load_collision_model().nearest_to_itself(path) for path in paths]
-            return all(near is None or near.distance >= SELF_MARGIN for near in nearest)
-
-        return self._shared("sound", (learned, stance), sound)
 
     def out_of_reach(self, nominal: Nominal) -> Mask:
         """(R,) added starts that the arm cannot get to.
@@ -307,28 +281,21 @@ class Follower:
 
     def _demonstrated(self, learned: Learned, stance: Stance | None = None) -> Lift:
         """The joints along the rollouts from the task's starts. Raises UnreachableError, also a second time."""
-        if stance is not None:
-            stood = lambda: _lift_demonstrated(self.robot, learned, np.array(stance))  # noqa: E731
-            return self._shared("stance", (learned, stance), stood, newest=NUM_STANCES)
-        lifted = self._shared("demonstrated", learned, lambda: _lift_usual(self.robot, learned))
-        if isinstance(lifted, UnreachableError):
-            raise lifted
-        return lifted
 
+        def lifted() -> Lift | UnreachableError:
+            starts, bundle = learned.task.starts, learned.demonstrated.bundle
+            try:
+                reference = inverse_kinematics(self.robot, starts.mean(axis=0)) if stance is None else np.array(stance)
+            except UnreachableError as error:
+                return error
+            stride = np.linspace(0, len(bundle.index) // len(starts) - 1, NUM_CONFIGURATIONS).round().astype(int)
+            fractions = bundle.fraction.reshape(len(starts), -1)[:, stride]
+            return lift(self.robot, fractions, bundle.positions.reshape(len(starts), -1, 3)[:, stride], reference)
 
-def _lift_usual(robot: Robot, learned: Learned) -> Lift | UnreachableError:
-    try:
-        return _lift_demonstrated(robot, learned, inverse_kinematics(robot, learned.task.starts.mean(axis=0)))
-    except UnreachableError as error:
-        return error
-
-
-def _lift_demonstrated(robot: Robot, learned: Learned, reference: Array) -> Lift:
-    bundle, num_rollouts = learned.demonstrated.bundle, len(learned.task.starts)
-    stride = np.linspace(0, len(bundle.index) // num_rollouts - 1, NUM_CONFIGURATIONS).round().astype(int)
-    fractions = bundle.fraction.reshape(num_rollouts, -1)[:, stride]
-    paths = bundle.positions.reshape(num_rollouts, -1, 3)[:, stride]
-    return lift(robot, fractions, paths, reference)
+        found = self._shared("demonstrated", (learned, stance), lifted, newest=NUM_STANCES)
+        if isinstance(found, UnreachableError):
+            raise found
+        return found
 
 
 def _mean(paths: Sequence[Array]) -> Array:

@@ -14,8 +14,7 @@ from dt_viz.avoidance.start_status import StartStatus
 from dt_viz.flows.fields import Array
 from dt_viz.motion.following import Follower
 from dt_viz.motion.nominal import Nominal
-from dt_viz.motion.stack import LIVE, Precision, Solution, build_stack
-from dt_viz.motion.warp import warped_stack
+from dt_viz.motion.stack import LIVE, Precision, Solution, build_stack, warped_stack
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.warning import ARM, Kind, MotionWarning
 

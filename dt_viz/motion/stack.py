@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dt_viz.avoidance.detour import Detour
 from dt_viz.avoidance.passing import ANEW, Passing
 from dt_viz.avoidance.transform import Built, MotionBelow, Transform
 from dt_viz.flows.augmented_systems import OnPlaces, frozen, on_places
@@ -142,59 +141,96 @@ def build_stack(
         precision: how exactly.
         passing: sides to keep while obstacles are dragged.
     """
-    detours = [passing.hand.get(place, ()) for place, _ in layers]
-    solution, places = None, nominal.learned.places
+    solution = None
     for keeps_goal in (True, False):
-        rays, bundle = nominal.rays, nominal.bundle
-        ends_below = nominal.ends
-        earlier, above = [None] * len(layers), (None,) * len(layers)
+        motions = _Motions(nominal.ends, nominal.rays, nominal.bundle)
+        built: list[tuple[MotionBelow, Built]] = []
         for _ in range(MAX_ATTEMPTS):
             lowest = MotionBelow(
                 nominal.starts,
                 nominal.goal,
-                bundle.index,
-                bundle.levels[:, 0],
+                motions.bundle.index,
+                motions.bundle.levels[:, 0],
                 tolerance=precision.tolerance,
                 keeps_goal=keeps_goal,
                 shaping=nominal.shaping,
                 gradual=precision is LIVE,
             )
-            built = _build(layers, lowest, earlier, above, detours)
-            above = _above([made for _, made in built])
-            earlier = [made for _, made in built]
+            built = _build(layers, lowest, [made for _, made in built], passing)
             outer = [made.transform for _, made in built]
-            goal = built[-1][1].goal if built else nominal.goal
-
-            ends = np.concatenate([nominal.starts, [goal]])
-            below = Chain(outer).forward(ends) if outer else ends
-            if np.abs(below - ends_below).max() > precision.ends:
-                rays, ends_below = nominal.rays_between(below), below
-                bundle = replace(bundle, levels=places(rays.at(bundle.index, bundle.fraction))[:, None])
-            bundle = replace(bundle, levels=climb(bundle.levels[:, 0], outer))
-            bundle = refined(bundle, lambda i, u, r=rays, s=outer: climb(places(r.at(i, u)), s), precision.spacing)
-            solution = Solution(chained(nominal, outer), rays, bundle, _applied(layers, built, above, bundle))
-            if not any(applied.may_improve for applied in solution.built):
+            motions = motions.through(nominal, outer, built[-1][1].goal if built else nominal.goal, precision)
+            applied = _applied(layers, built, motions.bundle)
+            solution = Solution(chained(nominal, outer), motions.rays, motions.bundle, applied)
+            if not any(layer.may_improve for layer in applied):
                 return solution
         assert solution is not None
-        if not any(applied.transform.yields_goal and applied.may_improve for applied in solution.built):
+        if not any(layer.transform.yields_goal and layer.may_improve for layer in solution.built):
             break  # the goal has nothing to do with it
     assert solution is not None
     return solution
 
 
+def warped_stack(nominal: Nominal, full: Solution, fraction: float, precision: Precision) -> Solution:
+    """The rollouts of a stack whose flows run for a fraction of their durations.
+
+    At 0 motions are the base attractor's, straight to the goal; at 1 they are those of the stack. In between, too, each
+    transform is a diffeomorphism and motions are exact: starts and goal stay, so the rays of base space are those
+    between their images.
+
+    Args:
+        nominal: warped by the same fraction.
+        full: the stack whose flows they are. Where it moves the goal, motions end that fraction of the way.
+        fraction: s, from 0 to 1.
+        precision: as it was solved with.
+    """
+    outer = [applied.made.transform.scaled(fraction) for applied in full.built]
+    built = tuple(
+        replace(applied, made=replace(applied.made, transform=transform))
+        for applied, transform in zip(full.built, outer, strict=True)
+    )
+    moved = built[-1].made.goal - nominal.goal if built else np.zeros_like(nominal.goal)
+    motions = _Motions(nominal.ends, nominal.rays, nominal.bundle)
+    motions = motions.through(nominal, outer, nominal.goal + fraction * moved, precision)
+    return Solution(chained(nominal, outer), motions.rays, motions.bundle, built)
+
+
+@dataclass(frozen=True, eq=False)
+class _Motions:
+    """Rollouts on all levels of a stack."""
+
+    ends: Array
+    """(R + 1, 3) places below the stack that the rays begin and end at, metres."""
+    rays: Rays
+    bundle: Bundle
+
+    def through(self, nominal: Nominal, outer: Sequence[Diffeomorphism], goal: Array, precision: Precision) -> _Motions:
+        """The rollouts to a goal (3,), metres, through these transforms of places on the undisturbed motion."""
+        ends, places = np.concatenate([nominal.starts, [goal]]), nominal.learned.places
+        below, rays, bundle = Chain(outer).forward(ends) if outer else ends, self.rays, self.bundle
+        moves = np.abs(below - self.ends).max() > precision.ends
+        if moves:
+            rays = nominal.rays_between(below)
+        lowest = places(rays.at(bundle.index, bundle.fraction)) if moves else bundle.levels[:, 0]
+        bundle = replace(bundle, levels=climb(lowest, outer))
+        bundle = refined(bundle, lambda i, u: climb(places(rays.at(i, u)), outer), precision.spacing)
+        return _Motions(below if moves else self.ends, rays, bundle)
+
+
 def _build(
-    layers: Sequence[tuple[int, Layer]],
-    motion: MotionBelow,
-    earlier: Sequence[Built | None],
-    above: Sequence[Diffeomorphism | None],
-    detours: Sequence[tuple[Detour | None, ...]],
+    layers: Sequence[tuple[int, Layer]], motion: MotionBelow, earlier: Sequence[Built], passing: Passing
 ) -> list[tuple[MotionBelow, Built]]:
-    """Each layer's transform, with the motion that it was made for."""
+    """Each layer's transform, with the motion that it was made for; `earlier` is what the last attempt made, if any."""
     built: list[tuple[MotionBelow, Built]] = []
     targets: list[Point] = []
-    for (_, layer), last, outer, known in zip(layers, earlier, above, detours, strict=True):
-        told = {"name": layer.name, "earlier": last, "above": outer, "targets": tuple(targets)}
-        motion = replace(motion, **told, detours=known)
+    for k, (place, layer) in enumerate(layers):
+        motion = replace(
+            motion,
+            name=layer.name,
+            earlier=earlier[k] if earlier else None,
+            above=_above(earlier, k),
+            targets=tuple(targets),
+            detours=passing.hand.get(place, ()),
+        )
         made = layer.transform.build(motion)
         built.append((motion, made))
         if layer.transform.anchor is not None:
@@ -204,22 +240,19 @@ def _build(
     return built
 
 
-def _above(built: Sequence[Built]) -> tuple[Diffeomorphism | None, ...]:
-    """For each transform, the chain of those above it."""
-    transforms = [[made.transform for made in built[k + 1 :]] for k in range(len(built))]
-    return tuple(Chain(stacked) if stacked else None for stacked in transforms)
+def _above(built: Sequence[Built], k: int) -> Diffeomorphism | None:
+    """The chain of the transforms above one of them."""
+    transforms = [made.transform for made in built[k + 1 :]]
+    return Chain(transforms) if transforms else None
 
 
 def _applied(
-    layers: Sequence[tuple[int, Layer]],
-    built: Sequence[tuple[MotionBelow, Built]],
-    above: Sequence[Diffeomorphism | None],
-    bundle: Bundle,
+    layers: Sequence[tuple[int, Layer]], built: Sequence[tuple[MotionBelow, Built]], bundle: Bundle
 ) -> tuple[Applied, ...]:
     """The layers as they were made, and whether they find in the bundle what they were made for."""
-    found = []
-    for (place, layer), (motion, made), outer in zip(layers, built, above, strict=True):
-        at = {"positions": bundle.levels[:, len(found) + 1], "top": bundle.positions, "above": outer}
+    found, every = [], [made for _, made in built]
+    for k, ((place, layer), (motion, made)) in enumerate(zip(layers, built, strict=True)):
+        at = {"positions": bundle.levels[:, k + 1], "top": bundle.positions, "above": _above(every, k)}
         satisfied = layer.transform.satisfied(replace(motion, index=bundle.index, **at))
         found.append(Applied(place, layer.name, layer.transform, made, satisfied))
     return tuple(found)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.kernels.arm import BODY_POINT
 from dt_viz.kernels.blocks import clearance
+from dt_viz.kernels.proximity import least_contacts
 from dt_viz.obstacles.arrays import records
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.union import Union
@@ -107,6 +108,15 @@ class BodyPoints:
         shapes, values = records(obstacle.parts if isinstance(obstacle, Union) else (obstacle,))
         most = np.array(np.broadcast_to(enough, len(q)), dtype=float)
         return clearance(robot.records, self.spheres, shapes, values, np.array(q, order="C"), most)
+
+    def self_clearance(self, robot: Robot, q: Array, enough: float) -> float:
+        """Compute the smallest distance, metres, of links that no joint connects at configurations q (N, 6), rad.
+
+        It is too small by twice `PROTRUSION` at most, and at most `enough`.
+        """
+        a, b = np.nonzero(self.joint[:, None] + 1 < self.joint)
+        pairs = self.indices[np.stack([a, b], axis=1)]
+        return float(least_contacts(robot.records, self.spheres, pairs, np.array(q, order="C"), enough).min())
 
     @cached_property
     def by_joint(self) -> list[tuple[int, slice]]:

@@ -155,6 +155,12 @@ class TestStance:
         again = Section(robot, lifted.reference).postures(robot.end_effector(q))
         np.testing.assert_allclose(again, q, rtol=0, atol=1e-3)
 
+    def test_the_meshes_keep_clear_of_each_other_in_all_stances(self, follower, beside):
+        known, model = follower.stances(beside[0].learned), load_collision_model()
+        for stance in range(0, len(known.references), 20):
+            near = [model.nearest_to_itself(q) for q in (known.on_path[stance], *known.at_starts[stance][:, None])]
+            assert all(nearest is None or nearest.distance >= SELF_MARGIN for nearest in near)
+
     def test_the_motion_ends_at_the_goal_around_the_obstacle(self, engine, beside, robot):
         nominal, avoidance = beside
         scenario = changed(Scenario(nominal.task.name), obstacles=avoidance.avoided.parts, space="cspace")

@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.robot.body_points import PROTRUSION, BodyPoints, load_body_points
-from dt_viz.robot.collision import load_collision_model
+from dt_viz.robot.collision import SELF_REACH, SELF_TOLERANCE, load_collision_model
 from dt_viz.robot.robot import LinkMesh, collision_meshes
 from dt_viz.shipped import ASSETS
 
@@ -185,6 +185,16 @@ def test_where_the_spheres_clear_an_obstacle_the_meshes_clear_it_by_at_least_as_
             checked += 1
             found_out += [wrong(changed(body, radius=-6e-3)), wrong(changed(body, offset=0.01)), wrong(body.outermost)]
     assert checked >= 10 and (found_out > checked / 4).all()
+
+
+def test_links_keep_at_least_as_far_from_each_other_as_their_spheres_and_hardly_farther(body, robot):
+    """By coal's distances of meshes."""
+    model, paths = load_collision_model(), random_configurations(robot, 1, (300, 1))
+    found = [(model.nearest_to_itself(q), body.self_clearance(robot, q, SELF_REACH)) for q in paths]
+    near = [(nearest.distance, asked) for nearest, asked in found if nearest is not None]
+    apart = [true - asked for true, asked in near if true > 0]
+    assert len(apart) > 20
+    assert -SELF_TOLERANCE < min(apart) <= max(apart) < 2 * PROTRUSION + SELF_TOLERANCE
 
 
 def test_distances_end_where_they_are_enough(body, robot):
