@@ -21,8 +21,6 @@ from dt_viz.warning import MotionWarning
 
 NUM_SAMPLES, NUM_ADDED_SAMPLES = 200, 100
 """Samples of each rollout before refinement: from the task's starts, and from added ones."""
-MAX_CHORDS, IMAGE_TOLERANCE = 6, 1e-9
-"""Steps towards the images of moved ends, and metres by which they may miss."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +31,6 @@ class NominalTrajectory:
     """(3,), metres."""
     image: Array
     """ψ of the state in which it begins, (k,)."""
-    jacobian: Array
-    """(k, 3) derivative of ψ with respect to the place, there."""
     fraction: Array
     """(n,) where on its base ray the samples are."""
     positions: Array
@@ -72,16 +68,6 @@ class Learned:
         base = replace(base, goal=transform.forward(self.system.transform.inverse(base.goal)))
         return replace(self, system=DiffeomorphicSystem(transform, base))
 
-    @cached_property
-    def at_goal(self) -> tuple[Array, Array]:
-        """ψ (1, k) and its derivative (1, k, 3) with respect to the place, at the goal."""
-        return self.images(self.system.transform.inverse(self.system.base.goal[None]))
-
-    def images(self, states: Array) -> tuple[Array, Array]:
-        """ψ (N, k) of states (N, k), and its derivatives (N, k, 3) with respect to the places."""
-        along = np.broadcast_to(np.eye(states.shape[1])[:, :3], (*states.shape, 3))
-        return self.system.transform.forward_tangents(states, along)
-
     def places(self, base_states: Array) -> Array:
         """Places (N, 3), metres, of base states (N, k): the first coordinates of ψ⁻¹."""
         return self.system.transform.inverse(base_states)[:, :3]
@@ -108,10 +94,10 @@ class Learned:
         return replace(own, trajectories=(*own.trajectories, *added), status=status) if added else own
 
     def _trajectories(self, states: Array, num_samples: int) -> tuple[NominalTrajectory, ...]:
-        images, jacobians = self.images(states)
+        images = self.system.transform.forward(states)
         rays = Rays(images, self.system.base)
         bundle = evenly_sampled(lambda i, u: self.places(rays.at(i, u))[:, None], len(states), num_samples)
-        parts = states[:, :3], images, jacobians, bundle.split(bundle.fraction), bundle.paths
+        parts = states[:, :3], images, bundle.split(bundle.fraction), bundle.paths
         return tuple(NominalTrajectory(*part) for part in zip(*parts, strict=True))
 
 
@@ -187,13 +173,13 @@ class Nominal:
     def warped(self, fraction: float) -> Nominal:
         """The rollouts with the imitation's flows run for a fraction of their durations; samples keep their places."""
         learned = self.learned.warped(fraction)
-        images, jacobians = learned.images(self.states)
+        images = learned.system.transform.forward(self.states)
         bundle = self.bundle
         samples = Rays(images, learned.system.base).at(bundle.index, bundle.fraction)
         paths = bundle.split(learned.places(samples))
         trajectories = (
-            replace(trajectory, image=image, jacobian=jacobian, positions=path)
-            for trajectory, image, jacobian, path in zip(self.trajectories, images, jacobians, paths, strict=True)
+            replace(trajectory, image=image, positions=path)
+            for trajectory, image, path in zip(self.trajectories, images, paths, strict=True)
         )
         return replace(self, learned=learned, trajectories=tuple(trajectories))
 
@@ -210,12 +196,6 @@ class Nominal:
     def rest(self, rollout: int) -> Array:
         """(k − 3,) what the state in which a rollout begins consists of besides the place."""
         return self.rays.z0[rollout, 3:].copy()
-
-    def states_of(self, rollout: int) -> Array:
-        """(n, k) states of the samples of a rollout."""
-        trajectory = self.trajectories[rollout]
-        samples = self.rays.at(np.full(len(trajectory.fraction), rollout), trajectory.fraction)
-        return np.concatenate([trajectory.positions, samples[:, 3:]], axis=1)
 
     @cached_property
     def rays(self) -> Rays:
@@ -240,19 +220,7 @@ class Nominal:
         return np.concatenate([self.starts, [self.goal]])
 
     def rays_between(self, ends: Array) -> Rays:
-        """Rays of motions that begin and end elsewhere, not far away: `ends` (R + 1, 3), metres; see `ends`."""
-        *z0, z_e = self._images(ends)
+        """Rays of motions that begin and end elsewhere: `ends` (R + 1, 3), metres; see `ends`."""
+        rest = np.concatenate([self.rays.z0[:, 3:], [self.system.base.goal[3:]]])
+        *z0, z_e = self.system.transform.forward(np.concatenate([ends, rest], axis=1))
         return Rays(np.stack(z0), replace(self.system.base, goal=z_e))
-
-    def _images(self, ends: Array) -> Array:
-        """ψ of the states at `ends`: by chord steps on ψ⁻¹, which is the cheaper side of ψ."""
-        at_goal, J_at_goal = self.learned.at_goal
-        images = np.concatenate([self.rays.z0, at_goal])
-        J = np.concatenate([[trajectory.jacobian for trajectory in self.trajectories], J_at_goal])
-        error = ends - self.ends
-        for _ in range(MAX_CHORDS):
-            images = images + (J @ error[..., None])[..., 0]
-            error = ends - self.learned.places(images)
-            if np.abs(error).max() <= IMAGE_TOLERANCE:
-                return images
-        return self.system.transform.forward(np.concatenate([ends, images[:, 3:]], axis=1))

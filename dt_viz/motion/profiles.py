@@ -68,17 +68,20 @@ def profiles(motion: Solved, drawn: DrawnSamples, rollout: int, follower: Follow
     obstacle, of_mean = motion.scenario.obstacle, bool(nominal.added[rollout])
     demonstration = task.mean_path if of_mean else task.paths[rollout]
     paths, below = (drawn.positions[rows], nominal.paths[rollout]), drawn.positions[rows]
+    index, fraction = np.full(len(nominal.paths[rollout]), rollout), nominal.trajectories[rollout].fraction
     if arm is None:
         clearances = [obstacle.signed_distance(path) for path in paths]
         depths = [maximum_collision_distance(path, obstacle.signed_distance) for path in paths]
     else:
-        fraction = nominal.trajectories[rollout].fraction
-        q = follower.undisturbed(nominal).at(np.full(len(fraction), rollout), fraction)
+        q = follower.undisturbed(nominal).at(index, fraction)
         below = follower.robot.end_effector(arm.transform.forward(arm.p[rows]))
         clearances = [follower.whole_arm.clearance(postures, obstacle) for postures in (arm.p[rows], q)]
         depths = [-float(clearance.min()) for clearance in clearances]
-    states = motion.stack.states(drawn.index[rows], drawn.fraction[rows], below)
-    values = motion.stack.system.lyapunov(states), nominal.system.lyapunov(nominal.states_of(rollout))
+    samples = (
+        (motion.stack.system, motion.stack.rays.at(drawn.index[rows], drawn.fraction[rows]), below),
+        (nominal.system, nominal.rays.at(index, fraction), nominal.paths[rollout]),
+    )
+    values = [system.lyapunov(np.concatenate([places, at[:, 3:]], axis=1)) for system, at, places in samples]
     shown, undisturbed = (
         profile(path, demonstration, potential, clearance, depth)
         for path, potential, clearance, depth in zip(paths, values, clearances, depths, strict=True)

@@ -102,10 +102,6 @@ class Solution:
         """End effector (N, 3), metres, of the rollouts `index` (N,) at the fractions `fraction` (N,) of their rays."""
         return self.transform.inverse(self.rays.at(index, fraction))[:, :3]
 
-    def states(self, index: Indices, fraction: Array, positions: Array) -> Array:
-        """States (N, k) at positions (N, 3) of the rollouts `index` (N,) at the fractions `fraction` (N,)."""
-        return np.concatenate([positions, self.rays.at(index, fraction)[:, 3:]], axis=1)
-
 
 def cut_off(nominal: Nominal, solution: Solution, level: int) -> DiffeomorphicSystem:
     """The system on the manifold of a level, counted as in `Bundle.levels`: without what is stacked on it."""
