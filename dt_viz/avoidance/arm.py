@@ -24,7 +24,7 @@ from dt_viz.avoidance.arm_field import (
 )
 from dt_viz.avoidance.arm_solver import MAX_DURATION, SLOPE, TOLERANCE, ArmSolution, Solver
 from dt_viz.avoidance.avoidance import ArmAvoidance
-from dt_viz.avoidance.detour import Detour, escape_directions, remembered, travel
+from dt_viz.avoidance.detour import Detour, carried_over, escape_directions
 from dt_viz.avoidance.lift import Lift
 from dt_viz.avoidance.passing import ANEW, Passing
 from dt_viz.flows.fields import Array, Indices, Mask, VectorField
@@ -129,7 +129,7 @@ class WholeArm:
             passing: detours to keep while obstacles are dragged.
         """
         parts = avoidance.avoided.parts
-        known = remembered(passing.arm, parts)
+        known = carried_over(passing.arm, parts)
         sides, pins = self._sides(lifted, avoidance, known), self._pins(lifted)
         best = None
         for attempt in range(min(NUM_WAYS, max(map(len, sides), default=0))):
@@ -170,7 +170,7 @@ class WholeArm:
             passing: the detours of the motions where the obstacles were just before, and the duration of their flow.
         """
         parts = avoidance.avoided.parts
-        known = remembered(passing.arm, parts)
+        known = carried_over(passing.arm, parts)
         failed = not passing.cleared and passing.duration >= MAX_DURATION
         detours: list[Detour | None] = []
         for part, found, last in zip(parts, self._sides(lifted, avoidance, known), known, strict=True):
@@ -183,8 +183,7 @@ class WholeArm:
                 detours.append(_on_side(part, side, last).turned_from(last, found, avoidance.detour.turning))
         if not any(detours):
             return self.undisturbed(lifted, avoidance, spacing)
-        moved = max(travel(last.obstacle, part) for last, part in zip(known, parts, strict=True) if last is not None)
-        change = DURATION_CHANGE * moved
+        change = DURATION_CHANGE * max(last.travelled or 0.0 for last in known if last is not None)
         between = max(passing.duration - change, 0.0), min(passing.duration + change, MAX_DURATION)
         generator = self._generator(detours, avoidance, self._pins(lifted))
         solver = self._solver(lifted, avoidance, generator, spacing, coarse=True, between=between)

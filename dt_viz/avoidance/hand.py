@@ -11,9 +11,9 @@ import numpy as np
 
 from dt_viz.avoidance.avoidance import Avoidance
 from dt_viz.avoidance.clearing import clearing_duration, escape_lengths
-from dt_viz.avoidance.detour import Detour, DetourSettings, remembered
+from dt_viz.avoidance.detour import Detour, DetourSettings
 from dt_viz.avoidance.sideways import Encounter, fixing_ends
-from dt_viz.avoidance.transform import Aside, Built, MotionBelow, axes_of, start_warnings
+from dt_viz.avoidance.transform import Built, MotionBelow, Planar, SidewaysFlow, axes_of, start_warnings
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain, Diffeomorphism
 from dt_viz.flows.fields import Array, Mask, Projected, VectorField
 from dt_viz.flows.integrators import integrate_adaptive
@@ -46,7 +46,7 @@ place: such a path arrives at up to 60° from the straight way out."""
 
 
 @dataclass(frozen=True, init=False)
-class HandAvoidance(Avoidance, space="task"):
+class HandAvoidance(Avoidance, Planar, space="task"):
     """The end effector avoids (sec. 4.4)."""
 
     plane: tuple[Point, Point] | None
@@ -67,9 +67,6 @@ class HandAvoidance(Avoidance, space="task"):
     @property
     def acts(self) -> bool:
         return bool(self.obstacles)
-
-    def in_plane(self, plane: tuple[Point, Point]) -> HandAvoidance:
-        return replace(self, plane=plane)
 
     def _field(self) -> VectorField:
         field = self.avoided.field(self.generator, self.temperature)
@@ -96,13 +93,13 @@ class HandAvoidance(Avoidance, space="task"):
         """
         obstacle = self.avoided
         field = self._field()
-        detours, aside, motion = self._aside(motion)
-        spent = sum(flow.duration for flow in aside)
+        detours, sideways, motion = self._sideways(motion)
+        spent = sum(flow.duration for flow in sideways)
         at_least = max(0.0, motion.at_least - spent)
-        if aside and motion.earlier is not None:
+        if sideways and motion.earlier is not None:
             last = self.integration.of(AdaptiveFlow(field, at_least, motion.tolerance))
             motion = replace(
-                motion, positions=Chain([fixing_ends(first, last) for first in aside]).inverse(motion.positions)
+                motion, positions=Chain([fixing_ends(first, last) for first in sideways]).inverse(motion.positions)
             )
         num_demonstrated = len(motion.demonstrated.starts)
         covered = np.flatnonzero(_blocked(obstacle, motion))
@@ -134,8 +131,8 @@ class HandAvoidance(Avoidance, space="task"):
                     text = f"a motion does not leave the obstacle: {why}"
                     warnings.append(motion.warning(Kind.STAYS_INSIDE, text))
         flow: Diffeomorphism = self.integration.of(AdaptiveFlow(field, duration, motion.tolerance))
-        if aside:
-            flow = Chain([*(fixing_ends(first, flow) for first in aside), flow])
+        if sideways:
+            flow = Chain([*(fixing_ends(first, flow) for first in sideways), flow])
         goal = self._nearest_free(motion.goal) if motion.keeps_goal else flow.inverse(motion.goal)
         if obstacle.signed_distance(motion.goal) < 0:
             inside = -float(obstacle.signed_distance(goal))
@@ -143,24 +140,24 @@ class HandAvoidance(Avoidance, space="task"):
             warnings.append(motion.warning(Kind.GOAL_COVERED, f"the goal is inside the obstacle: motions {end}"))
         duration += spent
         chosen = {"duration": duration}
-        return Built(flow, duration, goal, hopeless, tuple(warnings), self.integration, chosen, detours, aside)
+        return Built(flow, duration, goal, hopeless, tuple(warnings), self.integration, chosen, detours, sideways)
 
-    def _aside(self, motion: MotionBelow) -> tuple[tuple[Detour | None, ...], tuple[Aside, ...], MotionBelow]:
+    def _sideways(self, motion: MotionBelow) -> tuple[tuple[Detour | None, ...], tuple[SidewaysFlow, ...], MotionBelow]:
         """Return detours around the obstacles, the flows that carry all motions to one side of each, and these there.
 
         Further attempts take those of the first, with the motion before them: for starts that the flows have moved into
         the obstacle they would be longer, and move these farther. A flow time by hand is spent on these first. In a
-        plane no way out turns from one side to the other, so none is remembered there. The paper's generator acts
+        plane no way out turns from one side to the other, so none is carried over there. The paper's generator acts
         alone.
         """
         if motion.earlier is not None:
-            return motion.earlier.detours, motion.earlier.aside, motion
+            return motion.earlier.detours, motion.earlier.sideways, motion
         detours: list[Detour | None] = [None] * len(self.obstacles)
-        aside: list[Aside] = []
+        sideways: list[SidewaysFlow] = []
         if self.generator == "probability":
             return tuple(detours), (), motion
         plane = None if self.plane is None else axes_of(self.plane)[:, :2]
-        known = remembered(motion.detours if plane is None else (), self.obstacles)
+        known = motion.detours if motion.detours and plane is None else (None,) * len(self.obstacles)
         margin = self._kept_margin(motion.demonstrated)
         left = math.inf if self.duration is None else self.duration
         for k, (obstacle, previous) in enumerate(zip(self.obstacles, known, strict=True)):
@@ -168,16 +165,16 @@ class HandAvoidance(Avoidance, space="task"):
             met = Encounter.of(seen, self._avoidable(seen), obstacle, margin, self.obstacles[:k], plane)
             if met is None:
                 continue
-            detours[k] = detour = met.detour(previous, self.detour, gradually=motion.gradual)
+            detours[k] = detour = met.detour(previous, self.detour)
             flow = met.flow(detour.direction, motion.tolerance)
             flow = self.integration.of(replace(flow, duration=min(flow.duration, left)))
             left -= flow.duration
             if flow.duration > 0:
-                aside.append(flow)
+                sideways.append(flow)
                 motion = replace(motion, positions=flow.inverse(motion.positions))
-        return tuple(detours), tuple(aside), motion
+        return tuple(detours), tuple(sideways), motion
 
-    def satisfied(self, motion: MotionBelow) -> bool:
+    def satisfied(self, motion: MotionBelow, top: Array) -> bool:
         """Return whether all avoidable samples keep (almost) the margin; true for any flow time by hand."""
         if self.duration is not None:
             return True

@@ -19,7 +19,7 @@ import numpy as np
 
 from dt_viz.avoidance.clearing import escape_lengths
 from dt_viz.avoidance.detour import Detour, DetourSettings, escape_directions
-from dt_viz.avoidance.transform import Aside, MotionBelow
+from dt_viz.avoidance.transform import MotionBelow, SidewaysFlow
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Diffeomorphism
 from dt_viz.flows.fields import Array, Mask, PointField
 from dt_viz.kernels.fields import ASIDE, TERM, Terms
@@ -73,13 +73,13 @@ class Sideways(PointField):
         return Terms(term, values)
 
 
-def fixing_ends(aside: Aside, outer: Diffeomorphism) -> Aside:
-    """The flow `aside` to a side, zero not at its ends but at their images under `outer`, which is stacked on it.
+def fixing_ends(flow: SidewaysFlow, outer: Diffeomorphism) -> SidewaysFlow:
+    """The flow to a side, zero not at its ends but at their images under `outer`, which is stacked on it.
 
     So `outer` alone moves the ends. Where it brought them into the field, that would carry them far into the obstacle.
     """
-    assert isinstance(aside.field, Sideways)
-    return replace(aside, field=replace(aside.field, ends=outer.forward(aside.field.ends)))
+    assert isinstance(flow.field, Sideways)
+    return replace(flow, field=replace(flow.field, ends=outer.forward(flow.field.ends)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,16 +124,15 @@ class Encounter:
         ends = ends[obstacle.signed_distance(ends) >= 0]
         return cls(obstacle, margin, motion.positions[inside], tangents, ends, tuple(others), plane)
 
-    def detour(self, previous: Detour | None, settings: DetourSettings, *, gradually: bool) -> Detour:
+    def detour(self, previous: Detour | None, settings: DetourSettings) -> Detour:
         """Choose the way out, on the side with the least detour, or the previous one while that costs little more.
 
-        Where turning there gradually would move the motions farther than going there at once, it is there at once: what
-        has just come near may make the way long in between.
+        Where turning there at a limited rate would move the motions farther than going there at once, it is there at
+        once: what has just come near may make the way long in between.
 
         Args:
-            previous: the detour around the obstacle where it was just before; None where there was none.
+            previous: the detour that is carried over from the obstacle's last pose; None where there was none.
             settings: how it is chosen.
-            gradually: whether it turns there as the obstacle moves on; else it is there at once.
         """
         found = escape_directions(
             self.points.T[None],
@@ -147,7 +146,7 @@ class Encounter:
             settings=settings,
         )
         there = self._measured(Detour(self.obstacle, found[0], found[0], kept=previous is not None))
-        if previous is None or not gradually:
+        if previous is None or previous.travelled is None:
             return there
         both = there, self._measured(there.turned_from(previous, found, settings.turning))
         return min(both, key=lambda detour: float(np.linalg.norm(detour.offset - previous.offset)))

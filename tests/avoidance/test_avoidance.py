@@ -122,7 +122,7 @@ def test_a_chosen_duration_is_taken_as_it_is():
     before = replace(before, earlier=AVOIDANCE.build(before))
     assert before.at_least > 0.2
     assert chosen.build(before).duration == 0.123
-    assert chosen.satisfied(before)  # nobody asked for more
+    assert chosen.satisfied(before, before.positions)  # nobody asked for more
 
 
 def test_covered_ends_are_named_and_do_not_keep_the_others_from_being_cleared():
@@ -147,7 +147,7 @@ def test_another_attempt_keeps_the_way_out_and_the_flow_along_it():
     first = AVOIDANCE.build(before)
     moved = replace(before, positions=first.transform.forward(before.positions), earlier=first)
     again = AVOIDANCE.build(moved)
-    assert first.aside and again.aside is first.aside and again.detours is first.detours
+    assert first.sideways and again.sideways is first.sideways and again.detours is first.detours
     assert again.duration >= first.duration
 
 

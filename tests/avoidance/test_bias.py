@@ -158,7 +158,7 @@ def test_one_motion_is_shifted_to_the_target(distance, radius):
     (shift,) = Chain([built.transform]).parts
     np.testing.assert_allclose(shift.inverse(np.array([0.0, distance, 0.0])), 0, atol=1e-5)
     after = replace(motion, positions=built.transform.inverse(motion.positions))
-    assert point.satisfied(after) and not point.satisfied(motion)
+    assert point.satisfied(after, after.positions) and not point.satisfied(motion, motion.positions)
 
 
 @settings(max_examples=6)
@@ -232,7 +232,7 @@ def test_a_chosen_strength_is_taken_as_it_is():
     assert motion.at_least > 0.2
     built = point.build(motion)
     assert built.duration == 0.2 and built.goal is motion.goal and not built.hopeless
-    assert point.satisfied(motion)  # nobody asked for more
+    assert point.satisfied(motion, motion.positions)  # nobody asked for more
 
 
 # several
