@@ -28,10 +28,6 @@ SNAPSHOT = 0.05
 of them, so a step is off by micrometres; between the last two checks the duration is interpolated."""
 TOLERANCE = 1e-5
 """Tolerance of a step of the integration up to the duration that is known to be needed, metres."""
-NUM_DEEPEST = 8
-"""Number of samples of each rollout that the duration is chosen for at first."""
-TINY = 1e-12
-"""Smallest distance between samples that counts as a step, metres."""
 ROUNDING = 1e-6
 """Depth that counts as rounding, metres: a motion may end on the surface."""
 ACCEPTED_MARGIN = 0.9
@@ -106,14 +102,7 @@ class HandAvoidance(Avoidance, Planar, space="task"):
         warnings = start_warnings(covered, num_demonstrated, Kind.START_COVERED, "inside the obstacle", motion.name)
         duration, hopeless = None if self.duration is None else self.duration - spent, False
         if duration is None:
-            # the deepest samples leave last, or nearly so; if they were not enough at the last attempt, take all
-            depth = np.where(self._avoidable(motion), obstacle.signed_distance(motion.positions), np.inf)
-            if at_least:
-                points = motion.positions[np.isfinite(depth)]
-            else:
-                crests = _crests(motion, depth, field, self._kept_margin(motion))
-                points = np.concatenate([_deepest(motion, depth), crests])
-            margin = self._kept_margin(motion)
+            points, margin = motion.positions[self._avoidable(motion)], self._kept_margin(motion)
             if at_least > 0:
                 points, _ = integrate_adaptive(field, points, None, -at_least, TOLERANCE)
             more = clearing_duration(
@@ -250,28 +239,3 @@ class HandAvoidance(Avoidance, Planar, space="task"):
 def _blocked(obstacle: Union, motion: MotionBelow) -> Mask:
     """Return which rollouts (R,) start inside the obstacle."""
     return obstacle.signed_distance(motion.starts) < 0
-
-
-def _deepest(motion: MotionBelow, depth: Array) -> Array:
-    """Return the deepest samples (M, 3) of each rollout; `depth` (N,), metres, is infinite for excluded ones."""
-    order = np.lexsort([depth, motion.index])
-    rank = np.arange(len(order)) - np.searchsorted(motion.index, motion.index)
-    return motion.positions[order[(rank < NUM_DEEPEST) & np.isfinite(depth[order])]]
-
-
-def _crests(motion: MotionBelow, depth: Array, field: VectorField, margin: float) -> Array:
-    """Find places (M, 3) between samples of the rollouts at which the field turns from leading onwards to leading back.
-
-    The field is a gradient, or nearly so: its potential is largest there, and points there leave last.
-    """
-    s, step = motion.positions, np.diff(motion.positions, axis=0)
-    near, same = depth < margin, np.diff(motion.index) == 0
-    k = np.flatnonzero(same & near[:-1] & near[1:])
-    here, there = (field(np.concatenate([s[k], s[k + 1]])) * np.tile(step[k], (2, 1))).sum(axis=1).reshape(2, -1)
-    turns = (here > 0) & (there < 0)
-    k, part = k[turns], (here / np.where(turns, here - there, 1))[turns, None]
-    # between two samples a path bends like the parabolas through them and the ones beside them; lengths tell them apart
-    length = np.maximum(np.linalg.norm(step, axis=1, keepdims=True), TINY)
-    bend, inner = np.zeros_like(s), (same[:-1] & same[1:])[:, None]
-    bend[1:-1] = np.diff(step / length, axis=0) / (length[:-1] + length[1:]) * inner
-    return s[k] + part * step[k] - part * (1 - part) * length[k] ** 2 * (bend[k] + bend[k + 1]) / 2
