@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dt_viz.avoidance.arm_field import LEVERS, SPEED, JointLimits
+from dt_viz.avoidance.arm_field import (
+    LEVERS,
+    REACH_PER_TEMPERATURE,
+    SPEED,
+    GradientField,
+    JointLimits,
+    WholeArmField,
+)
 from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.avoidance.clearing import clearing_duration
 from dt_viz.avoidance.detour import Detour
@@ -96,21 +103,34 @@ class Solver:
         limits: JointLimits,
         lifted: Lift,
         avoidance: ArmAvoidance,
-        generator: VectorField | None,
+        detours: Sequence[Detour | None],
         spacing: float,
         *,
-        coarse: bool,
+        coarse: bool = True,
         between: tuple[float, float] = (0.0, MAX_DURATION),
     ) -> None:
         self._robot, self._body, self._limits = robot, body, limits
         self._lifted = lifted
         self._avoidance = avoidance
-        self._generator = generator
+        self._detours = tuple(detours)
+        self._generator = self._generated([detour for detour in detours if detour is not None])
         self._spacing = spacing
-        self._coarse = coarse and generator is not None
-        self._shortest, self._longest = between
+        self._coarse = coarse and self._generator is not None
+        self._between = between
         self._margin = max(float(avoidance.margin), 2 * ROUNDING)
         self._room = body.clearance(robot, lifted.pins, avoidance.avoided, self._margin + ROUNDING) - ROUNDING
+
+    def _generated(self, met: Sequence[Detour]) -> VectorField | None:
+        """The field whose flow takes these detours, with starts and goal at rest; None without any."""
+        reach = REACH_PER_TEMPERATURE * self._avoidance.temperature
+        obstacles = tuple(detour.obstacle for detour in met)
+        if not met:
+            return None
+        if self._avoidance.generator == "probability":
+            return GradientField(self._robot, self._body, obstacles, reach)
+        pins = self._limits.forward(self._limits.inside(self._lifted.pins))
+        directions = np.stack([detour.direction for detour in met])
+        return WholeArmField(self._robot, self._body, obstacles, directions, pins, reach)
 
     def solution(self) -> ArmSolution:
         """Find the motions: with `auto`, after the shortest duration that clears them."""
@@ -121,19 +141,19 @@ class Solver:
             shaping = self._lifted.tracked.q[: self._lifted.num_shaping]
             q = self._limits.inside(shaping[:, ::STRIDE].reshape(-1, NUM_JOINTS))
             duration = self._clearing_duration(q[self._lack(q) > 0])
-        return self._with_duration(min(max(duration, self._shortest), self._longest))
+        return self._with_duration(float(np.clip(duration, *self._between)))
 
     def _with_duration(self, duration: float) -> ArmSolution:
         transform = self._transform(duration)
         bundle = self._sampled(transform)
         asked, kept = self._clearances(bundle.positions / LEVERS)
-        automatic = self._generator is not None and self._avoidance.duration is None
+        automatic, longest = self._generator is not None and self._avoidance.duration is None, self._between[1]
         for _ in range(MAX_ROUNDS if automatic else 0):
             lacking = self._shaping(bundle) & (asked > kept)
-            if duration >= self._longest or (asked - kept)[lacking].max(initial=0.0) <= ROUNDING:
+            if duration >= longest or (asked - kept)[lacking].max(initial=0.0) <= ROUNDING:
                 break
             p = bundle.positions[lacking] / LEVERS
-            more = min(self._clearing_duration(p), self._longest - duration)
+            more = min(self._clearing_duration(p), longest - duration)
             duration += more
             bundle, transform = self._continued(bundle, more, duration)
             asked, kept = self._clearances(bundle.positions / LEVERS)
@@ -162,9 +182,9 @@ class Solver:
         stuck, too_near = (np.unique(bundle.index[near & which]) for which in (shaping, ~shaping))
         away = np.linalg.norm(self._robot.end_effector(p) - self._robot.end_effector(q), axis=1) > MOVED
         moved = np.unique(bundle.index[away & ~shaping & (bundle.fraction == 0)])
-        return ArmSolution(
-            transform, bundle.index, bundle.fraction, q, p, duration, float(kept[shaping].min()), stuck, too_near, moved
-        )
+        clearance, detours = float(kept[shaping].min()), self._detours if any(self._detours) else ()
+        ends = stuck, too_near, moved
+        return ArmSolution(transform, bundle.index, bundle.fraction, q, p, duration, clearance, *ends, detours)
 
     def _shaping(self, bundle: Bundle) -> Mask:
         return bundle.index < self._lifted.num_shaping
@@ -215,7 +235,7 @@ class Solver:
     def _clearing_duration(self, p: Array) -> float:
         """The shortest duration after which the flow has carried configurations (N, 6) clear, or the longest."""
         assert self._generator is not None
-        return clearing(self._generator, self._limits, p, self._lack, SNAPSHOT, self._longest)
+        return clearing(self._generator, self._limits, p, self._lack, SNAPSHOT, self._between[1])
 
 
 def clearing(

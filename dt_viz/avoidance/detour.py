@@ -147,7 +147,7 @@ class Detour:
     rate; None where it is at its side at once."""
 
     @property
-    def is_there(self) -> bool:
+    def arrived(self) -> bool:
         """Whether it has turned to its side."""
         return self.direction is self.side
 
