@@ -141,16 +141,15 @@ class WholeArm:
     def followed(self, lifted: Lift, avoidance: ArmAvoidance, spacing: float, passing: Passing) -> ArmSolution:
         """Coarse motions that follow an obstacle which is dragged: they change no faster than the obstacle moves.
 
-        Detours turn towards the sides that are to be taken, and the flow's duration changes, by so much for each metre
-        of the drag. So no motion jumps, where a side is changed or none clears it: until the new way is there, motions
-        may come nearer to the obstacle than the margin. Where a way is there and does not clear it, the next side is
-        turned to. For the other arguments see `avoiding`.
+        Detours turn towards the sides that are to be taken, and the flow's duration changes, at rates limited by the
+        drag. So no motion jumps where the side changes or none clears the obstacle; until a detour has arrived at its
+        side, motions may come nearer than the margin. Where it has and does not clear, it turns to the next side.
 
         Args:
             lifted: the motions below.
             avoidance: what is to be avoided.
             spacing: as in `avoiding`.
-            passing: the detours of the motions where the obstacles were just before, and the duration of their flow.
+            passing: the detours around the obstacles at their last poses, and the duration of that flow.
         """
         known = carried_over(passing.arm, avoidance.avoided.parts)
         failed = not passing.cleared and passing.duration >= MAX_DURATION

@@ -208,14 +208,8 @@ class JointLimits(Diffeomorphism):
 
     def inside(self, q: Array) -> Array:
         """Clip configurations (*B, 6) to a little less than the limits, where ψ is finite."""
-        lowest, highest = self._innermost
-        return np.minimum(np.maximum(q, lowest), highest)
-
-    @cached_property
-    def _innermost(self) -> tuple[Array, Array]:
-        """Bounds (6,) of what is inside."""
         slack = (1 - NEAREST_TO_LIMIT) * self.zone
-        return self.lower + slack, self.upper - slack
+        return np.minimum(np.maximum(q, self.lower + slack), self.upper - slack)
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         part = self.fraction if inverse else -self.fraction

@@ -28,18 +28,18 @@ from dt_viz.robot.body_points import BodyPoints
 from dt_viz.robot.robot import NUM_JOINTS, Robot
 
 NUM_COARSE = 40
-"""The same for coarse motions."""
+"""Number of samples of each rollout of coarse motions, before refinement."""
 MAX_DURATION = 2.0
 """Longest flow that is tried: a contact at full strength moves by 40 cm in it."""
 SNAPSHOT = 0.1
-"""Flow time between two looks at the clearance: contacts move by at most two centimetres in it."""
+"""Flow time between two checks of the clearance: contacts move by at most two centimetres in it."""
 STRIDE = 3
-"""Every which sample the duration is chosen for at first: the time that they take to leave changes slowly along a
-rollout, and the deepest are not the last."""
+"""Stride of the samples that the duration is chosen for at first: the time that they take to escape changes slowly
+along a rollout."""
 MAX_ROUNDS = 4
-"""Rounds of refinement and of a longer flow where the samples that it adds are not clear."""
+"""Largest number of rounds in which the flow is prolonged for samples that refinement has added."""
 SLOPE = 0.1
-"""Clearance that is asked for, beside a start or goal that has less itself, for each metre of distance from it."""
+"""Slope, m/m, at which the required clearance grows away from a start or goal that has less than the margin."""
 MOVED = 5e-3
 """Smallest shift of an added start by the avoidance that is reported, metres."""
 ROUNDING = 1e-3
@@ -47,7 +47,7 @@ ROUNDING = 1e-3
 COARSE_STEP = 0.25
 """Length of a coarse RK4 step, in flow time: off by at most 1.2 mm at the hand in drags around Draw S and push box."""
 COARSE_SPACING = 0.025
-"""Distance, metres at the hand, about, up to which neighbouring samples of coarse motions may be apart."""
+"""Largest distance between neighbouring samples of coarse motions, metres at the hand, about."""
 TOLERANCE = 3e-9
 """Tolerance of a step of the fine flow, rad."""
 LONG = 1.0
@@ -74,11 +74,11 @@ class ArmSolution:
     """Smallest distance of the arm from the obstacle along the rollouts that shape the flow, metres; only where it is
     near, else less."""
     stuck: Indices
-    """Hosts that do not keep the clearance that is asked for."""
+    """Rollouts that shape the flow and do not keep the clearance that is asked for."""
     too_near: Indices
-    """Guests, counted among all rollouts, that do not keep it."""
+    """Rollouts from added starts that do not keep it, counted among all rollouts."""
     moved: Indices
-    """Guests that begin more than `MOVED` away from their start."""
+    """Those that begin more than `MOVED` away from their start."""
     detours: tuple[Detour | None, ...] = ()
     """Detour around each obstacle; None for those that are not in the way, empty where none is."""
 
@@ -89,7 +89,7 @@ class ArmSolution:
 
     @property
     def soon(self) -> bool:
-        """Whether they keep it after so short a flow that nothing better is looked for."""
+        """Whether they keep it after so short a flow that no other escape is tried."""
         return self.cleared and self.duration <= LONG
 
 
@@ -169,7 +169,7 @@ class Solver:
         return self._refined(replace(bundle, levels=levels), transform), transform
 
     def through(self, transform: Diffeomorphism, duration: float) -> ArmSolution:
-        """The motions of a transform that is there already, of which that is the full duration."""
+        """The motions of a given transform, of which that is the full duration."""
         bundle = self._sampled(transform)
         return self._along(bundle, transform, duration, *self._clearances(bundle.positions / LEVERS))
 
@@ -226,8 +226,8 @@ class Solver:
     def _clearances(self, p: Array) -> tuple[Array, Array]:
         """Clearances (N,), metres, that are asked for at configurations (N, 6), and that are kept.
 
-        Asked for is the margin, or what the starts and goal beside a configuration have. What is kept ends where it is
-        more by what a contact moves between two looks at it.
+        Asked for is the margin, or what the starts and goal beside a configuration have. What is kept is cut off where
+        it is more by what a contact moves between two checks.
         """
         asked = room_asked(np.array(p, order="C"), self._lifted.pins, self._room, LEVERS, SLOPE, self._margin)
         return asked, self._body.clearance(self._robot, p, self._avoidance.avoided, asked + SPEED * SNAPSHOT)
@@ -248,7 +248,7 @@ def clearing(
         limits: of the joints.
         p: (N, 6) rad.
         lack: distances (N,), metres, by which postures (N, 6) miss the clearance that is asked for.
-        step: flow time between two looks at the clearance.
+        step: flow time between two checks of the clearance.
         longest: flow time.
     """
     duration = clearing_duration(field, limits.forward(p), lambda state: lack(limits.inverse(state)), step, longest)

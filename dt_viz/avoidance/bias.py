@@ -214,7 +214,7 @@ class BiasPoint(Anchored):
         if self.moves_goal:
             last = np.r_[np.flatnonzero(np.diff(motion.index)), len(motion.index) - 1]
             return np.linalg.norm(self.offsets(motion.positions[last]), axis=1)
-        return closest_distances(self, motion)
+        return np.linalg.norm(self.offsets(closest_points(self, motion)[0]), axis=1)
 
     def _auto_radius(self, earlier: Built | None, distance: float, ends: float, others: float) -> float:
         """Large for gentle turns, but such that what is to stay where it is stays outside, where that is possible."""
@@ -283,8 +283,3 @@ def closest_points(point: BiasPoint, motion: MotionBelow) -> tuple[Array, Array]
     nearest = motion.positions[k] + part[k, None] * (motion.positions[k + 1] - motion.positions[k])
     tangents = step[k] @ point.axes()[:, : step.shape[1]].T / np.sqrt(np.maximum(squared[k], 1e-300))[:, None]
     return nearest, tangents
-
-
-def closest_distances(point: BiasPoint, motion: MotionBelow) -> Array:
-    """(R,) metres: how close each rollout comes to the target, in the plane if the bias acts in one."""
-    return np.linalg.norm(point.offsets(closest_points(point, motion)[0]), axis=1)

@@ -137,9 +137,9 @@ class Detour:
     side: Array
     """(3,) unit vector, the direction that was chosen."""
     direction: Array
-    """(3,) unit vector of the motions' way out: the same, or on its way there from another one."""
+    """(3,) unit vector, the escape direction of the motions: `side`, or turning to it from that of another side."""
     kept: bool = False
-    """Whether it was carried over from the detour at the obstacle's last pose."""
+    """Whether there was a detour that was carried over from the obstacle's last pose."""
     length: float = 0.0
     """Longest displacement of a motion of the hand along `direction`, metres."""
     travelled: float | None = None
@@ -148,7 +148,7 @@ class Detour:
 
     @property
     def arrived(self) -> bool:
-        """Whether it has turned to its side."""
+        """Whether the motions escape to the side that was chosen."""
         return self.direction is self.side
 
     @property
@@ -157,7 +157,7 @@ class Detour:
         return self.length * self.direction
 
     def turned_from(self, previous: Detour, escapes: Sequence[Array], turning: float) -> Detour:
-        """The detour on its way here from the previous one, by an angle for each metre that the obstacle has moved.
+        """Turn from the previous detour towards this one, by an angle for each metre that the obstacle has moved.
 
         Args:
             previous: the detour that is carried over from the obstacle's last pose.
@@ -172,7 +172,7 @@ class Detour:
 def carried_over(
     detours: Sequence[Detour | None], obstacles: Sequence[Obstacle], *, turn: bool = True
 ) -> tuple[Detour | None, ...]:
-    """The detours around obstacles that are dragged, or rest where a drag has ended; None for the others.
+    """Carry detours over to the obstacles that are dragged, or rest where a drag has ended; None for the others.
 
     Args:
         detours: those of the last motion, one for each obstacle, or none.
@@ -192,9 +192,9 @@ def carried_over(
 
 
 def turned(start: Array, towards: Array, most: float, escapes: Sequence[Array] = ()) -> Array:
-    """The unit vector `start` (3,), turned towards another one by an angle of at most `most`, rad.
+    """Turn the unit vector `start` (3,) towards another one by an angle of at most `most`, rad.
 
-    To the opposite it turns over the first of the `escapes` (3,) that is across both.
+    To the opposite one it turns over the first of the `escapes` (3,) that is across both.
     """
     if start @ towards < OPPOSITE:
         towards = next((escape for escape in escapes if abs(start @ escape) < -OPPOSITE), towards)

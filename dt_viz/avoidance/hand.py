@@ -33,7 +33,7 @@ ROUNDING = 1e-6
 ACCEPTED_MARGIN = 0.9
 """Smallest part of the margin that samples between the checked ones may keep."""
 BESIDE = 1e-3
-"""Tolerance of an obstacle's surface, metres, which is only nearly known, and of the depth of a covered start."""
+"""Tolerance of the surface of an obstacle, metres, which is known approximately; also of a covered start's depth."""
 NUM_DIRECTIONS = 360
 """Number of directions of a plane in which a way out of obstacles is searched."""
 TAIL = 2.0
@@ -98,7 +98,7 @@ class HandAvoidance(Avoidance, Planar, space="task"):
                 motion, positions=Chain([fixing_ends(first, last) for first in sideways]).inverse(motion.positions)
             )
         num_demonstrated = len(motion.demonstrated.starts)
-        covered = np.flatnonzero(_blocked(obstacle, motion))
+        covered = np.flatnonzero(obstacle.signed_distance(motion.starts) < 0)
         warnings = start_warnings(covered, num_demonstrated, Kind.START_COVERED, "inside the obstacle", motion.name)
         duration, hopeless = None if self.duration is None else self.duration - spent, False
         if duration is None:
@@ -220,7 +220,7 @@ class HandAvoidance(Avoidance, Planar, space="task"):
         goal_covered = motion.keeps_goal and obstacle.signed_distance(motion.goal) < 0
         instead = self._nearest_free(motion.goal) if goal_covered else motion.goal
         avoidable = np.ones(len(free), dtype=bool)
-        for rollout, blocked in enumerate(_blocked(obstacle, motion)):
+        for rollout, blocked in enumerate(obstacle.signed_distance(motion.starts) < 0):
             if not (blocked or goal_covered):
                 continue
             rows = np.flatnonzero(motion.index == rollout)
@@ -234,8 +234,3 @@ class HandAvoidance(Avoidance, Planar, space="task"):
                 tail[: outside[-1] + 1 if len(outside) else 0] = False
                 avoidable[rows[tail]] = False
         return avoidable
-
-
-def _blocked(obstacle: Union, motion: MotionBelow) -> Mask:
-    """Return which rollouts (R,) start inside the obstacle."""
-    return obstacle.signed_distance(motion.starts) < 0
