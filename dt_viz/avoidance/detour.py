@@ -100,7 +100,7 @@ def escape_directions(
     Returns:
         Unit vectors (3,), one for each distinct escape; all of them where there is a previous one.
     """
-    directions = _around(plane, settings.num_directions)
+    directions = directions_around(plane, settings.num_directions)
     centres, radii = obstacle.cover()
     if velocity is not None and (speed := float(np.linalg.norm(velocity))) > 0:
         ahead = np.arange(0, min(settings.seconds_ahead * speed, settings.metres_ahead), settings.stride)
@@ -121,8 +121,8 @@ def escape_directions(
     return found
 
 
-def _around(plane: Array | None, num: int) -> Array:
-    """Unit vectors (num, 3) all around, in space or in a plane."""
+def directions_around(plane: Array | None, num: int) -> Array:
+    """Unit vectors (num, 3) all around, in space or in the plane of orthonormal columns (3, 2)."""
     if plane is None:
         return golden_spiral(num, 0.5)
     turn = np.linspace(0, 2 * np.pi, num, endpoint=False)

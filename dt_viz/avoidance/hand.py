@@ -11,7 +11,7 @@ import numpy as np
 
 from dt_viz.avoidance.avoidance import Avoidance
 from dt_viz.avoidance.clearing import clearing_duration, escape_lengths
-from dt_viz.avoidance.detour import Detour, DetourSettings
+from dt_viz.avoidance.detour import Detour, DetourSettings, directions_around
 from dt_viz.avoidance.sideways import Encounter, fixing_ends
 from dt_viz.avoidance.transform import Built, MotionBelow, Planar, SidewaysFlow, axes_of, start_warnings
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain, Diffeomorphism
@@ -76,8 +76,7 @@ class HandAvoidance(Avoidance, Planar, space="task"):
         obstacle = self.avoided
         if self.plane is None or obstacle.signed_distance(goal) >= 0:
             return obstacle.nearest_free(goal)
-        turn = np.linspace(0, 2 * np.pi, NUM_DIRECTIONS, endpoint=False)
-        directions = np.column_stack([np.cos(turn), np.sin(turn)]) @ axes_of(self.plane)[:, :2].T
+        directions = directions_around(axes_of(self.plane)[:, :2], NUM_DIRECTIONS)
         length = escape_lengths(obstacle, goal, directions)
         return goal + length.min() * directions[length.argmin()]
 
