@@ -22,7 +22,7 @@ from dt_viz.avoidance.arm_field import (
     JointLimits,
     WholeArmField,
 )
-from dt_viz.avoidance.arm_solver import MAX_DURATION, SLOPE, TOLERANCE, ArmSolution, Solver
+from dt_viz.avoidance.arm_solver import MAX_DURATION, SLOPE, ArmSolution, Solver
 from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.avoidance.detour import Detour, escape_directions, remembered, travel
 from dt_viz.avoidance.lift import Lift
@@ -88,9 +88,6 @@ class WholeArm:
             lambda: dodge(dodging, forecast, still, still, still, still, 0.0),
             lambda: escape_directions(points, self.body.radius, np.eye(3)[:1], obstacle, margin=2.0),
             lambda: field(q),
-            lambda: field.rk4(q, 1.0, 1),
-            lambda: field.dormand_prince(q, 1.0, TOLERANCE, 1000),
-            lambda: field.with_jacobian(q),
             lambda: obstacle.field("free-space", 1.0)(np.zeros((1, 3))),  # the hand's fields
         )
         for done, call in enumerate(calls, start=1):
