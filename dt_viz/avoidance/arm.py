@@ -22,7 +22,7 @@ from dt_viz.avoidance.arm_field import (
     JointLimits,
     WholeArmField,
 )
-from dt_viz.avoidance.arm_solver import MAX_DURATION, SLOPE, ArmSolution, Solver
+from dt_viz.avoidance.arm_solver import MAX_DURATION, ROUNDING, SLOPE, ArmSolution, Solver
 from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.avoidance.detour import Detour, escape_directions, remembered, travel
 from dt_viz.avoidance.lift import Lift
@@ -217,9 +217,11 @@ class WholeArm:
         solver = self._solver(lifted, avoidance, None, spacing, coarse=True)
         return replace(solver.through(full.transform.scaled(fraction), full.duration), detours=full.detours)
 
-    def clearance(self, q: Array, obstacle: Union | Obstacle, enough: ArrayLike = np.inf) -> Array:
+    def clearance(
+        self, q: Array, obstacle: Union | Obstacle, highest: ArrayLike = np.inf, lowest: ArrayLike = -np.inf
+    ) -> Array:
         """Distance (N,), metres, of arm and end effector from the obstacle; see `BodyPoints.clearance`."""
-        return self.body.clearance(self.robot, q, obstacle, enough)
+        return self.body.clearance(self.robot, q, obstacle, highest, lowest)
 
     def _generator(self, detours: Sequence[Detour | None], avoidance: ArmAvoidance, pins: Array) -> VectorField:
         """The field whose flow takes these detours, with these postures (K, 6) at rest, where the flow meets them."""
@@ -241,7 +243,8 @@ class WholeArm:
         tangents = np.gradient(self.robot.end_effector(q), axis=1).reshape(-1, 3)
         tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
         q = q.reshape(-1, NUM_JOINTS)
-        near: Mask = np.array([self.clearance(q, part, margin) < margin for part in parts]).reshape(len(parts), len(q))
+        near: Mask = np.array([self.clearance(q, part, margin, margin - ROUNDING) < margin for part in parts])
+        near = near.reshape(len(parts), len(q))
         clearance = np.array([self.body.outermost.clearance(self.robot, q, part, BESIDE) for part in parts])  # about
         clearance = clearance.reshape(len(parts), len(q))
 
