@@ -15,7 +15,7 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from dt_viz.avoidance.arm_field import LEVERS, JointLimits, WholeArmField
-from dt_viz.avoidance.arm_solver import MAX_DURATION, SLOPE, TOLERANCE, ArmSolution, Solver
+from dt_viz.avoidance.arm_solver import MAX_DURATION, ROUNDING, SLOPE, ArmSolution, Solver
 from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.avoidance.detour import Detour, carried_over, escape_directions
 from dt_viz.avoidance.lift import Lift
@@ -81,9 +81,6 @@ class WholeArm:
             lambda: dodge(dodging, forecast, still, still, still, still, 0.0),
             lambda: escape_directions(points, self.body.radius, np.eye(3)[:1], obstacle, margin=2.0),
             lambda: field(q),
-            lambda: field.rk4(q, 1.0, 1),
-            lambda: field.dormand_prince(q, 1.0, TOLERANCE, 1000),
-            lambda: field.with_jacobian(q),
             lambda: obstacle.field("free-space", 1.0)(np.zeros((1, 3))),  # the hand's fields
         )
         for done, call in enumerate(calls, start=1):
@@ -185,9 +182,11 @@ class WholeArm:
         solver = self._solver(lifted, avoidance, full.detours, spacing, coarse=False)
         return solver.through(full.transform.scaled(fraction), full.duration)
 
-    def clearance(self, q: Array, obstacle: Union | Obstacle, enough: ArrayLike = np.inf) -> Array:
+    def clearance(
+        self, q: Array, obstacle: Union | Obstacle, highest: ArrayLike = np.inf, lowest: ArrayLike = -np.inf
+    ) -> Array:
         """Distance (N,), metres, of arm and end effector from the obstacle; see `BodyPoints.clearance`."""
-        return self.body.clearance(self.robot, q, obstacle, enough)
+        return self.body.clearance(self.robot, q, obstacle, highest, lowest)
 
     def _sides(self, lifted: Lift, avoidance: ArmAvoidance, known: Sequence[Detour | None]) -> list[list[Array]]:
         """Escapes (3,) from each obstacle, the most promising first; none where nothing comes too near it.
@@ -199,7 +198,8 @@ class WholeArm:
         tangents = np.gradient(self.robot.end_effector(q), axis=1).reshape(-1, 3)
         tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
         q = q.reshape(-1, NUM_JOINTS)
-        near: Mask = np.array([self.clearance(q, part, margin) < margin for part in parts]).reshape(len(parts), len(q))
+        near: Mask = np.array([self.clearance(q, part, margin, margin - ROUNDING) < margin for part in parts])
+        near = near.reshape(len(parts), len(q))
         clearance = np.array([self.body.outermost.clearance(self.robot, q, part, BESIDE) for part in parts])  # about
         clearance = clearance.reshape(len(parts), len(q))
 

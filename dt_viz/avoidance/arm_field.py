@@ -16,6 +16,7 @@ import numpy as np
 from dt_viz.flows.diffeomorphisms import Diffeomorphism
 from dt_viz.flows.fields import Array, CompiledField
 from dt_viz.kernels import escape
+from dt_viz.kernels.dormand_prince import DORMAND_PRINCE, RATE, RK4
 from dt_viz.kernels.joint_limits import stretched
 from dt_viz.obstacles.arrays import records
 from dt_viz.obstacles.shapes import Obstacle
@@ -133,16 +134,19 @@ class WholeArmField(ArmField, CompiledField):
 
     def __call__(self, q: Array) -> Array:
         """Compute V_q at configurations `q` (N, 6), as (N, 6)."""
-        return escape.velocities(self._escape, np.array(q, order="C"))
+        return self._carried(q, RATE)
 
     def rk4(self, s: Array, duration: float, steps: int) -> Array:
-        return escape.flow(self._escape, np.array(s, order="C"), float(duration), steps)
+        return self._carried(s, RK4, duration, steps)
 
     def dormand_prince(self, s: Array, duration: float, tolerance: float, max_steps: int) -> Array:
-        points = np.array(s, order="C")
-        q, num_failed = escape.adaptive_flow(self._escape, points, float(duration), float(tolerance), max_steps)
-        if num_failed:
-            raise ArithmeticError(f"{num_failed} points need more than {max_steps} steps")
+        return self._carried(s, DORMAND_PRINCE, duration, max_steps, tolerance)
+
+    def _carried(self, q: Array, method: int, duration: float = 0.0, steps: int = 1, tolerance: float = 0.0) -> Array:
+        """Carry configurations `q` (N, 6) along the flow; see `dt_viz.kernels.flows.carry`."""
+        q = np.array(q, order="C")
+        if num_failed := escape.carry(self._escape, q, method, float(duration), int(steps), float(tolerance)):
+            raise ArithmeticError(f"{num_failed} postures need more than {steps} steps")
         return q
 
 
