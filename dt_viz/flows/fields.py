@@ -10,8 +10,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dt_viz.kernels.dormand_prince import RATE
 from dt_viz.kernels.fields import GRID, TERM, Terms
-from dt_viz.kernels.flows import RATE, carry
+from dt_viz.kernels.flows import carry
 
 Array = NDArray[np.floating[Any]]
 Indices = NDArray[np.integer[Any]]

@@ -12,8 +12,18 @@ from collections.abc import Callable
 import numpy as np
 
 from dt_viz.flows.fields import Array, CompiledField, PointField, VectorField
-from dt_viz.kernels.dormand_prince import ERROR, ROUNDING, SHORT, STAGES, TANGENT_TOLERANCE, first_step
-from dt_viz.kernels.flows import DORMAND_PRINCE, EULER, IMPLICIT_EULER, RK4
+from dt_viz.kernels.dormand_prince import (
+    DORMAND_PRINCE,
+    ERROR,
+    EULER,
+    RK4,
+    ROUNDING,
+    SHORT,
+    STAGES,
+    TANGENT_TOLERANCE,
+    first_step,
+)
+from dt_viz.kernels.flows import IMPLICIT_EULER
 
 Step = Callable[[VectorField, Array, "Array | None", float], "tuple[Array, Array | None]"]
 

@@ -31,7 +31,12 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 def compiled(function: F) -> F:
     """Compile a function that kernels call; errors of arithmetic give nan or inf as in numpy."""
-    return _dispatcher(function)
+    return _dispatcher(function, no_cfunc_wrapper=True)
+
+
+def inlined(function: F) -> F:
+    """Put a function's source into its one caller: what is compiled by itself is compiled again within each caller."""
+    return _dispatcher(function, inline="always")
 
 
 def kernel(function: F) -> F:

@@ -1,11 +1,11 @@
-"""The Dormand–Prince 5(4) pair: the lengths of its steps, and the flow of a field in such steps."""
+"""Flows by explicit methods; of the Dormand–Prince 5(4) pair the lengths of its steps, too."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from dt_viz.kernels.compiled import compiled
-from dt_viz.kernels.runge_kutta import Array, Field, Rate, Rows, Work, add, largest, moving, rates
+from dt_viz.kernels.compiled import compiled, inlined
+from dt_viz.kernels.runge_kutta import Array, Field, Rate, Rows, Work, add, carry_in_steps, largest, moving, rates
 
 STAGES = np.array(
     [
@@ -33,6 +33,10 @@ STRAIGHT = 0.1
 LONGEST_TURN, TURN_ERROR = 0.8, 3e-4
 """Length of a first step, in units of the time in which the velocity changes by its own size, and the error of such a
 step relative to its motion, about."""
+
+
+RATE, EULER, RK4, DORMAND_PRINCE = 0, 1, 2, 3
+"""What is done to states: they become their rates of change, or are carried along in steps, last adaptive ones."""
 
 
 @compiled
@@ -73,11 +77,37 @@ def next_step(h: float, error: float) -> float:
     return h * min(max(0.9 * max(error, 1e-10) ** -0.2, 0.1), 5.0)
 
 
-@compiled
-def carry_adaptively(
+@inlined
+def carry_explicitly(
     rate: Rate,
     field: Field,
     states: Array,
+    d: int,
+    method: int,
+    duration: float,
+    steps: int,
+    tolerance: float,
+    lanes: int,
+    work: Work,
+) -> int:
+    """Carry states (N, m) along, in place, by one of the methods above; see `dt_viz.kernels.flows.carry`."""
+    first, num_failed = rates(rate, field, states, d, lanes, work), 0
+    if method == RATE:
+        states[:] = first
+    elif method == DORMAND_PRINCE:
+        num_failed = _carry_adaptively(rate, field, states, first, d, duration, tolerance, steps, lanes, work)
+    else:
+        stages = 4 if method == RK4 else 1
+        carry_in_steps(rate, field, states, first, d, stages, duration, steps, lanes, work)
+    return num_failed
+
+
+@inlined
+def _carry_adaptively(
+    rate: Rate,
+    field: Field,
+    states: Array,
+    first: Array,
     d: int,
     duration: float,
     tolerance: float,
@@ -85,14 +115,15 @@ def carry_adaptively(
     lanes: int,
     work: Work,
 ) -> int:
-    """Carry states (N, m) along, in place, each with steps of its own; returns how many need more than `max_steps`.
+    """Carry states (N, m) with the rates `first` (N, m) along, in place, each with steps of its own.
+
+    Returns how many need more than `max_steps`.
 
     See `dt_viz.flows.integrators.integrate_adaptive`. Where a state has arrived, another takes its lane.
     """
     m, total, sign = states.shape[1], abs(duration), 1.0 if duration > 0 else -1.0
-    first = rates(rate, field, states, d, lanes, work, np.empty_like(states))
     waiting = moving(first)
-    steps = _first_steps(rate, field, states, d, duration, tolerance, lanes, work, first, waiting)
+    steps = _first_steps(rate, field, states, first, waiting, d, duration, tolerance, lanes, work)
     k, start, end, defect = np.empty((7, m, lanes)), np.empty((m, lanes)), np.empty((m, lanes)), np.empty((m, lanes))
     rows, tried, h, left = np.empty(lanes, np.int64), np.empty(lanes, np.int64), np.empty(lanes), np.empty(lanes)
     n, upcoming, num_failed = 0, 0, 0
@@ -132,18 +163,18 @@ def carry_adaptively(
             rows[p], tried[p], h[p], left[p] = rows[n], tried[n], h[n], left[n]
 
 
-@compiled
+@inlined
 def _first_steps(
     rate: Rate,
     field: Field,
     states: Array,
+    first: Array,
+    rows: Rows,
     d: int,
     duration: float,
     tolerance: float,
     lanes: int,
     work: Work,
-    first: Array,
-    rows: Rows,
 ) -> Array:
     """Lengths of the first steps from rows (K,) of states with the rates `first` (N, m).
 
@@ -156,7 +187,7 @@ def _first_steps(
         ahead[k] = min(total, tolerance / speed) if speed > 0 else 0.0
         for i in range(d):
             there[k, i] += (ahead[k] if duration > 0 else -ahead[k]) * first[rows[k], i]
-    rates(rate, field, there, d, lanes, work, there)
+    there = rates(rate, field, there, d, lanes, work)
     for k in range(len(rows)):
         state, own = states[rows[k]], first[rows[k]]
         speed, turning = largest(own, 0, d), 0.0

@@ -10,8 +10,7 @@ from dt_viz.kernels.arm import Array, BodyPoints, Joints
 from dt_viz.kernels.blocks import LANES, MOST_JOINTS, Blocks, block_of, chain, keep, measure, put, turning
 from dt_viz.kernels.compiled import compiled, kernel
 from dt_viz.kernels.distances import Record, Shapes, Values
-from dt_viz.kernels.dormand_prince import carry_adaptively
-from dt_viz.kernels.runge_kutta import carry_in_steps, rates
+from dt_viz.kernels.dormand_prince import carry_explicitly
 
 BLOCK = block_of(
     ("velocity", (MOST_JOINTS,)),  # V_q, rad per unit of flow time
@@ -259,30 +258,9 @@ def _rate(escape: Escape, states: Array, n: int, d: int, work: Blocks, into: Arr
 
 
 @kernel
-def velocities(escape: Escape, q: Array) -> Array:
-    """V_q (N, n) at postures q (N, n)."""
+def carry(escape: Escape, q: Array, method: int, duration: float, steps: int, tolerance: float) -> int:
+    """Carry postures q (N, n) along the flow, in place; see `dt_viz.kernels.flows.carry`."""
     memory = np.empty(1, BLOCK)
-    result = rates(_rate, escape, q, q.shape[1], LANES, memory, np.empty_like(q))
+    num_failed = carry_explicitly(_rate, escape, q, q.shape[1], method, duration, steps, tolerance, LANES, memory)
     keep(memory)
-    return result
-
-
-@kernel
-def flow(escape: Escape, q: Array, duration: float, steps: int) -> Array:
-    """Postures q (N, n) carried along by classical Runge–Kutta steps of equal length, (N, n)."""
-    q, memory = q.copy(), np.empty(1, BLOCK)
-    carry_in_steps(_rate, escape, q, q.shape[1], 4, duration, steps, LANES, memory)
-    keep(memory)
-    return q
-
-
-@kernel
-def adaptive_flow(escape: Escape, q: Array, duration: float, tolerance: float, max_steps: int) -> tuple[Array, int]:
-    """Postures q (N, n) carried along by Dormand–Prince steps, and how many of them need more than `max_steps`.
-
-    The estimated error of a step is at most `tolerance`, rad.
-    """
-    q, memory = q.copy(), np.empty(1, BLOCK)
-    num_failed = carry_adaptively(_rate, escape, q, q.shape[1], duration, tolerance, max_steps, LANES, memory)
-    keep(memory)
-    return q, num_failed
+    return num_failed

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from dt_viz.kernels.compiled import compiled, kernel
-from dt_viz.kernels.dormand_prince import carry_adaptively
+from dt_viz.kernels.compiled import compiled, inlined, kernel
+from dt_viz.kernels.dormand_prince import carry_explicitly
 from dt_viz.kernels.fields import FieldWork, Terms, field_work, velocity
 from dt_viz.kernels.gaussians import LANES, Array
-from dt_viz.kernels.runge_kutta import add, carry_in_steps, load, moving, rates, store
+from dt_viz.kernels.runge_kutta import add, load, moving, rates, store
 
-RATE, EULER, RK4, IMPLICIT_EULER, DORMAND_PRINCE = 0, 1, 2, 3, 4
-"""What is done to states: they become their rates of change, or are carried along in steps, last adaptive ones."""
+IMPLICIT_EULER = 4
+"""A method beside those of `dt_viz.kernels.dormand_prince`."""
 MAX_ITERATIONS = 200
 """Largest number of Newton's iterations for a step of implicit Euler."""
 
@@ -61,7 +61,7 @@ def _invert(h: float, DV: Array, n: int, inverse: Array) -> None:
         inverse[2, 1, p], inverse[2, 2, p] = (b * i - a * j) * scale, (a * e - b * c) * scale
 
 
-@compiled
+@inlined
 def _newton(y: Array, states: Array, n: int, h: float, V: Array, inverse: Array, scale: float, memory: Array) -> bool:
     """Correct y (d, L) by Newton's method for y − h·V(y) = s; where the residual has grown, go back half the way.
 
@@ -93,7 +93,7 @@ def _newton(y: Array, states: Array, n: int, h: float, V: Array, inverse: Array,
     return not worse and correction <= 1e-8 * scale
 
 
-@compiled
+@inlined
 def _implicit_euler(
     field: Terms, states: Array, n: int, d: int, h: float, begun: bool, work: FieldWork, memory: Array
 ) -> None:
@@ -112,15 +112,16 @@ def _implicit_euler(
                 for p in range(n):
                     into[p] += factor[p] * source[p]
     else:
-        add(h, velocity(field, s, n, 0, work)[0], s, n, y)
+        add(h, velocity(field, s, n, int(d < 0), work)[0], s, n, y)
     memory[7, 0, :] = np.inf
+    both = int(d > 0)  # not the constant 1, of which numba would compile the fields once more
     for _ in range(MAX_ITERATIONS):
-        V, DV = velocity(field, y, n, 1, work)
+        V, DV = velocity(field, y, n, both, work)
         _invert(h, DV, n, inverse)
         if _newton(y, states, n, h, V, inverse, scale, memory[5:8]):
             break
     if len(states) > d:
-        _invert(h, velocity(field, y, n, 1, work)[1], n, inverse)
+        _invert(h, velocity(field, y, n, both, work)[1], n, inverse)
         tangents = memory[1, : len(states)]
         tangents[:] = states
         _multiply(inverse, tangents, n, d, states)
@@ -128,11 +129,11 @@ def _implicit_euler(
     s[:] = y
 
 
-@compiled
+@inlined
 def _carry_implicitly(field: Terms, states: Array, d: int, duration: float, steps: int, work: FieldWork) -> None:
     """Carry states (N, m) along in equal steps of implicit Euler, in place."""
-    m, first = states.shape[1], rates(_rate, field, states, d, LANES, work, np.empty_like(states))
-    rows, block, memory = moving(first), np.empty((m, LANES)), np.empty((9, max(m, 3), LANES))
+    m, rows = states.shape[1], moving(rates(_rate, field, states, d, LANES, work))
+    block, memory = np.empty((m, LANES)), np.empty((9, max(m, 3), LANES))
     for begin in range(0, len(rows), LANES):
         n = min(LANES, len(rows) - begin)
         load(states, rows, begin, n, block)
@@ -158,13 +159,7 @@ def carry(field: Terms, states: Array, d: int, method: int, duration: float, ste
         Number of states that need more adaptive steps.
     """
     work = field_work(field, d)
-    if method == RATE:
-        rates(_rate, field, states, d, LANES, work, states)
-    elif method == IMPLICIT_EULER:
+    if method == IMPLICIT_EULER:
         _carry_implicitly(field, states, d, duration, steps, work)
-    elif method == DORMAND_PRINCE:
-        return carry_adaptively(_rate, field, states, d, duration, tolerance, steps, LANES, work)
-    else:
-        stages = 4 if method == RK4 else 1
-        carry_in_steps(_rate, field, states, d, stages, duration, steps, LANES, work)
-    return 0
+        return 0
+    return carry_explicitly(_rate, field, states, d, method, duration, steps, tolerance, LANES, work)

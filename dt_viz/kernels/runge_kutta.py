@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dt_viz.kernels.compiled import compiled
+from dt_viz.kernels.compiled import compiled, inlined
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
@@ -68,9 +68,9 @@ def largest(row: Array, begin: int, end: int) -> float:
 
 
 @compiled
-def rates(rate: Rate, field: Field, states: Array, d: int, lanes: int, work: Work, found: Array) -> Array:
-    """Write rates of change to `found` (N, m), and return that; it may be the states (N, m) themselves."""
-    rows = np.arange(len(states))
+def rates(rate: Rate, field: Field, states: Array, d: int, lanes: int, work: Work) -> Array:
+    """Rates of change (N, m) of states (N, m)."""
+    rows, found = np.arange(len(states)), np.empty_like(states)
     block, into = np.empty((states.shape[1], lanes)), np.empty((states.shape[1], lanes))
     for begin in range(0, len(states), lanes):
         n = min(lanes, len(states) - begin)
@@ -91,13 +91,24 @@ def moving(rates: Array) -> Rows:
     return rows[:num]
 
 
-@compiled
+@inlined
 def carry_in_steps(
-    rate: Rate, field: Field, states: Array, d: int, stages: int, duration: float, steps: int, lanes: int, work: Work
+    rate: Rate,
+    field: Field,
+    states: Array,
+    first: Array,
+    d: int,
+    stages: int,
+    duration: float,
+    steps: int,
+    lanes: int,
+    work: Work,
 ) -> None:
-    """Carry states (N, m) along in equal steps, in place: explicit Euler's of one stage, or the classical four."""
+    """Carry states (N, m) with the rates `first` (N, m) along in equal steps, in place.
+
+    They are explicit Euler's of one stage, or the classical method's of four.
+    """
     m, h = states.shape[1], duration / steps
-    first = rates(rate, field, states, d, lanes, work, np.empty_like(states))
     rows = moving(first)
     start, there, k, total = np.empty((m, lanes)), np.empty((m, lanes)), np.empty((m, lanes)), np.empty((m, lanes))
     for begin in range(0, len(rows), lanes):
@@ -105,11 +116,9 @@ def carry_in_steps(
         load(states, rows, begin, n, start)
         load(first, rows, begin, n, k)
         for step in range(steps):
-            if step > 0:
-                rate(field, start, n, d, work, k)
             total[:] = 0
             for stage in range(stages):
-                if stage > 0:
+                if step + stage > 0:
                     rate(field, there, n, d, work, k)
                 weight = h if stages == 1 else (h / 6 if stage in (0, 3) else h / 3)
                 ahead = h if stage == 2 else h / 2
@@ -118,6 +127,7 @@ def carry_in_steps(
                         total[i, p] += weight * k[i, p]
                         there[i, p] = start[i, p] + ahead * k[i, p]
             add(1.0, total, start, n, start)
+            there[:] = start
             if not any_moves(k, n):
                 break
         store(start, rows, begin, n, states)

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dt_viz.avoidance.detour import Detour, carried_over
 from dt_viz.avoidance.passing import ANEW, Passing
-from dt_viz.avoidance.transform import Built, MotionBelow, Transform
+from dt_viz.avoidance.transform import Anchored, Built, MotionBelow, Transform
 from dt_viz.flows.augmented_systems import OnPlaces, frozen, on_places
 from dt_viz.flows.diffeomorphisms import Chain, Diffeomorphism, Identity
 from dt_viz.flows.fields import Array, Indices
@@ -137,6 +138,10 @@ def build_stack(
         precision: how exactly.
         passing: sides to keep while obstacles are dragged.
     """
+    detours = [
+        carried_over(passing.hand.get(place, ()), layer.transform.avoided.parts, turn=precision is LIVE)
+        for place, layer in layers
+    ]
     solution = None
     for keeps_goal in (True, False):
         motions = _Motions(nominal.ends, nominal.rays, nominal.bundle)
@@ -150,9 +155,8 @@ def build_stack(
                 tolerance=precision.tolerance,
                 keeps_goal=keeps_goal,
                 shaping=nominal.shaping,
-                gradual=precision is LIVE,
             )
-            built = _build(layers, lowest, [made for _, made in built], passing)
+            built = _build(layers, lowest, [made for _, made in built], detours)
             outer = [made.transform for _, made in built]
             motions = motions.through(nominal, outer, built[-1][1].goal if built else nominal.goal, precision)
             applied = _applied(layers, built, motions.bundle)
@@ -160,7 +164,7 @@ def build_stack(
             if not any(layer.may_improve for layer in applied):
                 return solution
         assert solution is not None
-        if not any(layer.transform.yields_goal and layer.may_improve for layer in solution.built):
+        if not any(layer.transform.avoided.parts and layer.may_improve for layer in solution.built):
             break  # the goal has nothing to do with it
     assert solution is not None
     return solution
@@ -213,24 +217,27 @@ class _Motions:
 
 
 def _build(
-    layers: Sequence[tuple[int, Layer]], motion: MotionBelow, earlier: Sequence[Built], passing: Passing
+    layers: Sequence[tuple[int, Layer]],
+    motion: MotionBelow,
+    earlier: Sequence[Built],
+    detours: Sequence[tuple[Detour | None, ...]],
 ) -> list[tuple[MotionBelow, Built]]:
     """Each layer's transform, with the motion that it was made for; `earlier` is what the last attempt made, if any."""
     built: list[tuple[MotionBelow, Built]] = []
     targets: list[Point] = []
-    for k, (place, layer) in enumerate(layers):
+    for k, (_, layer) in enumerate(layers):
         motion = replace(
             motion,
             name=layer.name,
             earlier=earlier[k] if earlier else None,
             above=_above(earlier, k),
             targets=tuple(targets),
-            detours=passing.hand.get(place, ()),
+            detours=detours[k],
         )
         made = layer.transform.build(motion)
         built.append((motion, made))
-        if layer.transform.anchor is not None:
-            targets.append(layer.transform.anchor)
+        if isinstance(layer.transform, Anchored):
+            targets.append(layer.transform.position)
         if len(built) < len(layers):
             motion = replace(motion, goal=made.goal, positions=made.transform.inverse(motion.positions))
     return built
@@ -248,7 +255,7 @@ def _applied(
     """The layers as they were made, and whether they find in the bundle what they were made for."""
     found, every = [], [made for _, made in built]
     for k, ((place, layer), (motion, made)) in enumerate(zip(layers, built, strict=True)):
-        at = {"positions": bundle.levels[:, k + 1], "top": bundle.positions, "above": _above(every, k)}
-        satisfied = layer.transform.satisfied(replace(motion, index=bundle.index, **at))
+        at = {"positions": bundle.levels[:, k + 1], "above": _above(every, k)}
+        satisfied = layer.transform.satisfied(replace(motion, index=bundle.index, **at), bundle.positions)
         found.append(Applied(place, layer.name, layer.transform, made, satisfied))
     return tuple(found)

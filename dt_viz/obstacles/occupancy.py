@@ -12,8 +12,9 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.special import expit
 
 from dt_viz.flows.fields import Array, GaussianGrid, Mask, PointField
+from dt_viz.kernels.dormand_prince import RATE
 from dt_viz.kernels.fields import OCCUPANCY, Terms
-from dt_viz.kernels.flows import RATE, carry
+from dt_viz.kernels.flows import carry
 
 Generator = Literal["free-space", "probability"]
 GENERATORS: tuple[Generator, ...] = ("free-space", "probability")
