@@ -51,9 +51,9 @@ def test_two_threads_that_compute_a_result_at_once_get_the_same_one():
     assert len(found) == 2 and found[0] is found[1]
 
 
-def test_engines_that_share_what_is_learned_and_stances_compute_them_once(fits, robot, initial, monkeypatch):
-    made, stances = [], following.stances
-    monkeypatch.setattr(following, "stances", lambda *given: made.append(1) or stances(*given))
+def test_engines_that_share_what_is_learned_and_postures_compute_them_once(fits, robot, initial, monkeypatch):
+    made, reference_postures = [], following.reference_postures
+    monkeypatch.setattr(following, "reference_postures", lambda *given: made.append(1) or reference_postures(*given))
     shared, scenario = Memo(), initial("push_box")
     x, y, z = scenario.obstacles[0].position
     beside = changed(scenario, obstacles=scenario.obstacles[0].moved((x - 0.1, y, z)), space="cspace")

@@ -51,7 +51,7 @@ COARSE_SPACING = 0.025
 TOLERANCE = 3e-9
 """Tolerance of a step of the fine flow, rad."""
 LONG = 1.0
-"""Flow time beyond which other escapes and stances are tried, too: such motions wind around the obstacle."""
+"""Flow time beyond which other escapes and reference postures are tried, too: such motions wind around the obstacle."""
 
 
 @dataclass(frozen=True, eq=False)

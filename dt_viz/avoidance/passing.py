@@ -1,4 +1,4 @@
-"""Sides on which motions pass obstacles, and stance of the arm: kept from one scenario to the next in a drag."""
+"""Detours of motions, and reference posture of the arm: kept from one scenario to the next in a drag."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from dt_viz.avoidance.detour import Detour, carried_over
 from dt_viz.avoidance.start_status import StartStatus
 from dt_viz.obstacles.shapes import Obstacle
 
-Stance = tuple[float, float, float, float, float, float]
+Posture = tuple[float, float, float, float, float, float]
 """Posture that the arm stays near to along all rollouts: six joint angles, rad."""
 
 
 @dataclass(frozen=True, eq=False)
 class Passing:
-    """Sides and stance of a motion, which the next one keeps while an obstacle is dragged."""
+    """Detours and reference posture of a motion, which the next one keeps while an obstacle is dragged."""
 
     hand: Mapping[int, tuple[Detour | None, ...]] = field(default_factory=dict)
     """Detours of the end effector around the obstacles of each layer, by its place in the stack."""
@@ -25,8 +25,8 @@ class Passing:
     """t of the flow by which the whole arm avoids."""
     cleared: bool = True
     """Whether that flow clears the obstacles."""
-    stance: Stance | None = None
-    """Stance of the arm; None is its usual one."""
+    posture: Posture | None = None
+    """Reference posture of the arm; None is its usual one."""
     status: tuple[StartStatus, ...] = ()
     """Status of each start, in the order of the scenario."""
 
@@ -40,4 +40,4 @@ class Passing:
 
 
 ANEW = Passing()
-"""Nothing to keep: sides and stance are chosen anew."""
+"""Nothing to keep: detours and reference posture are chosen anew."""

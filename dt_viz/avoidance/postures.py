@@ -1,6 +1,6 @@
-"""Stances: postures that an arm may stay near to along the motions of a task, where the usual one has no room.
+"""Reference postures: those that an arm may stay near to along the motions of a task, where the usual one has no room.
 
-The hand's position leaves three degrees of freedom, and several branches of the inverse kinematics. A stance chooses
+The hand's position leaves three degrees of freedom, and several branches of the inverse kinematics. One of them chooses
 among them for all motions of a task at once, as the reference of one section x → q (`robot.inverse_kinematics.track`).
 """
 
@@ -21,7 +21,7 @@ from dt_viz.robot.inverse_kinematics import loses_branch, track
 from dt_viz.robot.robot import NUM_JOINTS, Robot
 
 NUM_TRIED = 384
-"""Number of random postures that stances are made from."""
+"""Number of random postures that they are chosen from."""
 SPREAD = (0.2, 2.0)
 """Smallest and largest standard deviation of their joints from the usual posture, rad."""
 REACHED = 1e-4
@@ -30,13 +30,13 @@ IN_THE_WAY = 10.0
 """Cost of each metre that the mean motion lacks of the clearance that is asked for, against a metre from the usual
 postures."""
 ALIKE = 0.15
-"""Root mean square distance of postures, by `LEVERS`, up to which stances are alike, metres."""
+"""Root mean square distance of postures, by `LEVERS`, up to which reference postures are alike, metres."""
 AT_ENDS, ENDS = 40.0, 0.06
 """Factor by which that costs more at the ends of the motion, and distance from them over which this fades, metres."""
 
 
 @dataclass(frozen=True, eq=False)
-class Stances:
+class ReferencePostures:
     """Postures to stay near to, the usual one first, then the nearest to it."""
 
     robot: Robot
@@ -66,9 +66,9 @@ class Stances:
         """Distances (K, N), metres, at postures (K, N, 6), up to what is enough."""
         return self.body.clearance(self.robot, q.reshape(-1, NUM_JOINTS), obstacle, enough).reshape(q.shape[:2])
 
-    def alike(self, stance: int) -> Mask:
-        """(K,) which stances are like one of them."""
-        apart = (self.on_path - self.on_path[stance]) * LEVERS
+    def alike(self, posture: int) -> Mask:
+        """(K,) which postures are like one of them."""
+        apart = (self.on_path - self.on_path[posture]) * LEVERS
         return np.sqrt((apart**2).sum(axis=2).mean(axis=1)) < ALIKE
 
     def cost(self, obstacle: Union | Obstacle, asked: float) -> Array:
@@ -82,8 +82,8 @@ class Stances:
         return self.away + (self._stuck * lacking).mean(axis=1)
 
 
-def stances(robot: Robot, body: BodyPoints, usual: Array, starts: Array, path: Array) -> Stances:
-    """Find stances for the motions of a task.
+def reference_postures(robot: Robot, body: BodyPoints, usual: Array, starts: Array, path: Array) -> ReferencePostures:
+    """Find reference postures for the motions of a task.
 
     Random postures are brought to the mean start, then each follows all starts and the mean motion. Those stay that do
     so on one branch, inside the joint limits, away from singularities, no lower than the usual one or the table, and
@@ -97,7 +97,7 @@ def stances(robot: Robot, body: BodyPoints, usual: Array, starts: Array, path: A
         path: (T, 3) the mean motion, metres; its end is the goal.
 
     Returns:
-        The stances, whose pins are those at the starts and at the goal.
+        The reference postures, whose pins are those at the starts and at the goal.
     """
     rng = np.random.default_rng(0)  # the same for each visitor
     scale = rng.uniform(*SPREAD, size=(NUM_TRIED, 1))
@@ -117,4 +117,4 @@ def stances(robot: Robot, body: BodyPoints, usual: Array, starts: Array, path: A
     away = np.sqrt((((tracked.q - tracked.q[0]) * LEVERS) ** 2).sum(axis=2).mean(axis=1))
     order = np.argsort(np.where(sound, away, np.inf), kind="stable")[: sound.sum()]
     at_starts, on_path = np.split(tracked.q[order], [len(starts)], axis=1)
-    return Stances(robot, moving, references[order], at_starts, on_path, away[order])
+    return ReferencePostures(robot, moving, references[order], at_starts, on_path, away[order])

@@ -10,8 +10,8 @@ import numpy as np
 from dt_viz.avoidance.arm import WholeArm
 from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.avoidance.lift import NUM_CONFIGURATIONS, Lift, lift
-from dt_viz.avoidance.passing import Stance
-from dt_viz.avoidance.postures import Stances, stances
+from dt_viz.avoidance.passing import Posture
+from dt_viz.avoidance.postures import ReferencePostures, reference_postures
 from dt_viz.avoidance.start_status import StartStatus, start_warnings
 from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.memo import Memo
@@ -33,9 +33,9 @@ MAX_TRACKING_ERROR = 1e-3
 NUM_ARM_SAMPLES = 200
 """Samples of the motion that the arm shows where it follows a path of the end effector."""
 NUM_ON_PATH = 20
-"""Samples of the mean motion that stances are tried on."""
-NUM_STANCES = 64
-"""Number of stances, over all tasks, whose joints are kept."""
+"""Samples of the mean motion that reference postures are tried on."""
+NUM_POSTURES = 64
+"""Number of reference_postures, over all tasks, whose joints are kept."""
 NEWEST = 2 * MAX_STARTS
 """Number of added starts whose joints are kept."""
 
@@ -71,7 +71,7 @@ class Follower:
         Args:
             robot: the arm.
             memo: what keeps the joints along what a drag leaves unchanged.
-            shared: what keeps the stances of tasks, for other followers, too.
+            shared: what keeps the reference postures of tasks, for other followers, too.
         """
         self.robot = robot
         self.body = load_body_points()
@@ -85,7 +85,7 @@ class Follower:
         Raises:
             UnreachableError: the arm cannot get to where the motions start.
         """
-        own = self._demonstrated(nominal.learned, nominal.stance)
+        own = self._demonstrated(nominal.learned, nominal.posture)
         if nominal.shaping.all():
             return own
 
@@ -112,7 +112,7 @@ class Follower:
         Raises:
             UnreachableError: the arm cannot get to where the motions start.
         """
-        return self._demonstrated(nominal.learned, nominal.stance).reference
+        return self._demonstrated(nominal.learned, nominal.posture).reference
 
     def behaving(self, nominal: Nominal, solution: Solution, *, exact: bool) -> Lift:
         """The joints along the motion with the behaviours of the end effector.
@@ -156,42 +156,42 @@ class Follower:
         return track(self.robot, path, self.reference(nominal))
 
     def admission(
-        self, nominal: Nominal, avoidance: ArmAvoidance, stance: Stance | None = None, *, keeps: bool = False
+        self, nominal: Nominal, avoidance: ArmAvoidance, posture: Posture | None = None, *, keeps: bool = False
     ) -> Admission:
-        """Whether the whole arm can move around what it avoids, from which starts, and in which stance.
+        """Whether the whole arm can move around what it avoids, from which starts, and with which reference posture.
 
         Args:
             nominal: all rollouts.
             avoidance: what is to be avoided.
-            stance: that where the obstacle was just before, which is kept while none leaves more starts free; None is
+            posture: that where the obstacle was just before, which is kept while none leaves more starts free; None is
                 the usual one.
             keeps: whether it is kept while it leaves the goal and any start free.
         """
-        asked = avoidance.avoided, avoidance.margin, stance, keeps
+        asked = avoidance.avoided, avoidance.margin, posture, keeps
         return self._memo("admission", (nominal, asked), lambda: self._admission(nominal, *asked), newest=2)
 
     def alternatives(self, nominal: Nominal, avoidance: ArmAvoidance) -> Iterator[Nominal]:
-        """The same motions in other stances that have room at as many starts and at the goal, the best first."""
-        ranked = self._stances(nominal.learned, avoidance.avoided, avoidance.margin, nominal.stance, keeps=False)
+        """The same motions with other postures that have room at as many starts and at the goal, the best first."""
+        ranked = self._ranked(nominal.learned, avoidance.avoided, avoidance.margin, nominal.posture, keeps=False)
         _, free = next(ranked)
-        for stance, others in ranked:
+        for posture, others in ranked:
             if not (others >= free).all():
                 return
-            yield replace(nominal, stance=stance)
+            yield replace(nominal, posture=posture)
 
     def _admission(
-        self, nominal: Nominal, obstacle: Union, margin: float, last: Stance | None, keeps: bool
+        self, nominal: Nominal, obstacle: Union, margin: float, last: Posture | None, keeps: bool
     ) -> Admission:
         blocked = self._unreached(nominal.learned) or self._pedestal_touched(nominal.learned, obstacle)
         if blocked:
             return Admission(nominal, blocked)
-        stance, free = next(self._stances(nominal.learned, obstacle, margin, last, keeps=keeps))
+        posture, free = next(self._ranked(nominal.learned, obstacle, margin, last, keeps=keeps))
         if not free[-1]:
             text = "the goal is inside the obstacle: the arm there touches it"
             return Admission(nominal, (MotionWarning(Kind.GOAL_COVERED, text, ARM),))
         if not free[:-1].any():
             return Admission(nominal, nominal.without(~nominal.added, StartStatus.IN_COLLISION).warnings)
-        standing = replace(nominal, stance=stance)
+        standing = replace(nominal, posture=posture)
         touches = self.whole_arm.clearance(self.undisturbed(standing).tracked.q[:, 0], obstacle, 0.0) < 0
         touches[~nominal.added] = ~free[:-1]
         standing = standing.without(self.out_of_reach(standing), StartStatus.OUT_OF_REACH)
@@ -218,44 +218,44 @@ class Follower:
         text = f"the obstacle touches the arm's {name}, which cannot move away"
         return (MotionWarning(Kind.ARM_BLOCKED, text, ARM),)
 
-    def _stances(
-        self, learned: Learned, obstacle: Union, margin: float, last: Stance | None, *, keeps: bool
-    ) -> Iterator[tuple[Stance | None, Mask]]:
-        """The stances with most room at the task's starts and goal, the best first: the usual one where it has enough.
+    def _ranked(
+        self, learned: Learned, obstacle: Union, margin: float, last: Posture | None, *, keeps: bool
+    ) -> Iterator[tuple[Posture | None, Mask]]:
+        """The postures with most room at the task's starts and goal, the best first: the usual one where it has enough.
 
-        But the stance `last`, if it is not the usual one, comes before all that leave no more starts free; where it
+        But the posture `last`, if it is not the usual one, comes before all that leave no more starts free; where it
         is kept, before all, if it leaves the goal and any start free.
 
         Yields:
-            A stance, None for the usual one; which of the starts and the goal (R + 1,) it leaves free.
+            A reference posture, None for the usual one; which of the starts and the goal (R + 1,) it leaves free.
         """
         room = self.whole_arm.clearance(self._demonstrated(learned, last).pins, obstacle, margin)
         is_ample = last is None and bool((room >= margin).all())
         if is_ample or (keeps and room[-1] >= 0 and room[:-1].max() >= 0):
             yield last, room >= 0
-        known = self.stances(learned)
+        known = self.reference_postures(learned)
         clearance = known.room(obstacle, margin)
         free, ample = clearance >= 0, clearance >= margin
         left = ~known.alike(0) if is_ample else np.ones(len(free), bool)
         # the goal first, then as many starts as possible, then as much room as is asked for
         most = free[:, -1] * free.shape[1] + free.sum(axis=1)
-        kept = np.array([_as_stance(posture) == last for posture in known.references])
+        kept = np.array([_as_posture(posture) == last for posture in known.references])
         for best in np.lexsort((known.cost(obstacle, margin), -ample.sum(axis=1), ~kept, -most)):
             if left[best]:
                 left &= ~known.alike(int(best))
-                yield None if best == 0 else _as_stance(known.references[best]), free[best]
+                yield None if best == 0 else _as_posture(known.references[best]), free[best]
 
-    def stances(self, learned: Learned) -> Stances:
-        """The stances for a task's motions; the first time it takes a second or so.
+    def reference_postures(self, learned: Learned) -> ReferencePostures:
+        """The reference postures for a task's motions; the first time it takes a second or so.
 
         Raises:
             UnreachableError: the arm cannot get to where the motions start.
         """
         usual, paths = self._demonstrated(learned).reference, learned.demonstrated.paths
         return self._shared(
-            "stances",
+            "reference_postures",
             learned,
-            lambda: stances(self.robot, self.body, usual, learned.task.starts, _mean(paths)),
+            lambda: reference_postures(self.robot, self.body, usual, learned.task.starts, _mean(paths)),
         )
 
     def out_of_reach(self, nominal: Nominal) -> Mask:
@@ -279,20 +279,22 @@ class Follower:
             warnings.append(MotionWarning(Kind.DAMPED, text, ARM))
         return tuple(warnings)
 
-    def _demonstrated(self, learned: Learned, stance: Stance | None = None) -> Lift:
+    def _demonstrated(self, learned: Learned, posture: Posture | None = None) -> Lift:
         """The joints along the rollouts from the task's starts. Raises UnreachableError, also a second time."""
 
         def lifted() -> Lift | UnreachableError:
             starts, bundle = learned.task.starts, learned.demonstrated.bundle
             try:
-                reference = inverse_kinematics(self.robot, starts.mean(axis=0)) if stance is None else np.array(stance)
+                reference = (
+                    inverse_kinematics(self.robot, starts.mean(axis=0)) if posture is None else np.array(posture)
+                )
             except UnreachableError as error:
                 return error
             stride = np.linspace(0, len(bundle.index) // len(starts) - 1, NUM_CONFIGURATIONS).round().astype(int)
             fractions = bundle.fraction.reshape(len(starts), -1)[:, stride]
             return lift(self.robot, fractions, bundle.positions.reshape(len(starts), -1, 3)[:, stride], reference)
 
-        found = self._shared("demonstrated", (learned, stance), lifted, newest=NUM_STANCES)
+        found = self._shared("demonstrated", (learned, posture), lifted, newest=NUM_POSTURES)
         if isinstance(found, UnreachableError):
             raise found
         return found
@@ -304,7 +306,7 @@ def _mean(paths: Sequence[Array]) -> Array:
     return np.mean(paths, axis=0)[kept]
 
 
-def _as_stance(posture: Array) -> Stance:
+def _as_posture(posture: Array) -> Posture:
     a, b, c, d, e, f = (float(angle) for angle in posture)
     return a, b, c, d, e, f
 

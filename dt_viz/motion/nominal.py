@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from dt_viz.avoidance.passing import Stance
+from dt_viz.avoidance.passing import Posture
 from dt_viz.avoidance.start_status import StartStatus, start_warnings
 from dt_viz.flows.diffeomorphisms import Identity
 from dt_viz.flows.fields import Array, Mask
@@ -114,7 +114,7 @@ class Nominal:
     """(R) the rollouts."""
     status: tuple[StartStatus, ...]
     """(R) whether each start has a motion, or why it has none."""
-    stance: Stance | None = None
+    posture: Posture | None = None
     """Posture that the arm stays near to; None is its usual one."""
 
     @property

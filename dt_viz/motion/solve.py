@@ -19,7 +19,7 @@ from dt_viz.scenario.scenario import Scenario
 from dt_viz.warning import ARM, Kind, MotionWarning
 
 NUM_ALTERNATIVES = 3
-"""Number of other stances that are tried where the arm finds no way around the obstacle."""
+"""Number of other reference postures that are tried where the arm finds no way around the obstacle."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ class Solved:
     blocked: tuple[MotionWarning, ...] = ()
     """Why there is no motion to show, though its ends are free; empty where there is one."""
     passing: Passing = ANEW
-    """Sides and stance of the motion, under a warp those of the full one."""
+    """Detours and reference posture of the motion, under a warp those of the full one."""
 
     def rollouts_of(self, samples: Array) -> tuple[Array, ...]:
         """Values (N, …) of the samples of the end effector's stack for each start; none where it has no motion."""
@@ -61,7 +61,7 @@ def solve(scenario: Scenario, nominal: Nominal, precision: Precision, follower: 
         scenario: whose stack it is; its `warp` is left to `warped`. Sides on which the motions of its `passing` pass
             obstacles are kept while these are dragged.
         nominal: the undisturbed motion, from starts that the arm can begin at. Where the arm finds no way, that of the
-            result has another stance, or lacks the starts that have none.
+            result has another reference posture, or lacks the starts that have none.
         precision: how exactly.
         follower: the arm.
 
@@ -81,9 +81,9 @@ def solve(scenario: Scenario, nominal: Nominal, precision: Precision, follower: 
 
 
 def _with_a_way(scenario: Scenario, nominal: Nominal, follower: Follower) -> Solved:
-    """The motion at LIVE, in another stance or without the starts that have no way, where it finds none otherwise.
+    """The motion at LIVE, with another reference posture or without the starts that have no way, where it finds none.
 
-    The same choice serves each precision: it is quick at this one. A stance is also changed where the way is long,
+    The same choice serves each precision: it is quick at this one. A posture is also changed where the way is long,
     but not while an obstacle is dragged.
     """
     solved, avoidance = _solved(scenario, nominal, LIVE, follower), scenario.arm_avoidance
@@ -112,7 +112,7 @@ def _unless_it_touches(solved: Solved) -> Solved:
 
 def _as_many(nominal: Nominal, passing: Passing) -> Nominal:
     """The motion without the starts that had none just before, if any others that shape it are left."""
-    if passing.stance != nominal.stance:
+    if passing.posture != nominal.posture:
         return nominal
     before = dict(enumerate(passing.status))
     had_none = [before.get(place, StartStatus.OK) is not StartStatus.OK for place in range(len(nominal.status))]
@@ -123,12 +123,12 @@ def _as_many(nominal: Nominal, passing: Passing) -> Nominal:
 def _solved(
     scenario: Scenario, nominal: Nominal, precision: Precision, follower: Follower, *, follows: bool = False
 ) -> Solved:
-    """The motion in the stance of `nominal`, see `solve`; `follows` is whether it goes on in a drag."""
+    """The motion with the reference posture of `nominal`, see `solve`; `follows` is whether it goes on in a drag."""
     passing = scenario.passing or ANEW
     stack = build_stack(nominal, scenario.active, precision, passing)
     avoidance = scenario.arm_avoidance
     hand = {applied.place: applied.made.detours for applied in stack.built if any(applied.made.detours)}
-    passed = Passing(hand, stance=nominal.stance, status=nominal.status)
+    passed = Passing(hand, posture=nominal.posture, status=nominal.status)
     if avoidance is None:
         return Solved(scenario, nominal, nominal, stack, passing=passed)
     live = precision is LIVE

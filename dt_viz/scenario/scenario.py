@@ -232,7 +232,7 @@ class Scenario:
     """Name of the paper's scene that it began as, if any."""
     view: View = field(default_factory=View)
     passing: Passing | None = field(default=None, compare=False)
-    """Sides and stance that the motions keep while an obstacle is dragged; None until the session decides."""
+    """Detours and reference posture of motions, kept while an obstacle is dragged; None until the session decides."""
 
     @cached_property
     def active(self) -> tuple[tuple[int, Layer], ...]:

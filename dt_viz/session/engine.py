@@ -125,7 +125,7 @@ class Engine:
         yield frame
         if frame.motion.arm is not None and not frame.blocked:
             with _cores.slot(cancelled):
-                self.follower.stances(frame.motion.nominal.learned)  # a drag may need them at once
+                self.follower.reference_postures(frame.motion.nominal.learned)  # a drag may need them at once
         yield from self._compared_at_rest(frame, cancelled)
 
     # --- motion ---
@@ -167,7 +167,7 @@ class Engine:
     def _admission(self, scenario: Scenario, precision: Precision) -> Admission:
         """Whether the scenario has a motion, and from which starts.
 
-        While an obstacle is dragged the arm keeps its stance; where it rests, another one may leave more starts free.
+        While an obstacle is dragged the arm keeps its posture; where it rests, another one may leave more starts free.
         """
         nominal, avoidance = self.nominal(scenario), scenario.arm_avoidance
         if avoidance is None:
@@ -175,7 +175,7 @@ class Engine:
         passing = scenario.passing
         if passing is None or not passing.goes_on(avoidance.avoided.parts):
             return self.follower.admission(nominal, avoidance)
-        return self.follower.admission(nominal, avoidance, passing.stance, keeps=precision is LIVE)
+        return self.follower.admission(nominal, avoidance, passing.posture, keeps=precision is LIVE)
 
     def solved(self, scenario: Scenario, precision: Precision) -> Solved:
         """The motion of a scenario whose goal and some start are free, at a precision; what it raises see `frames`.

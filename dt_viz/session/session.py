@@ -94,7 +94,7 @@ class Session:
 
         Args:
             gesture: which control is being moved; edits by one control in quick succession are undone together.
-            anew: whether sides and stance are chosen anew, not kept from the motion that is shown.
+            anew: whether detours and reference posture are chosen anew, not kept from the motion that is shown.
             **changes: fields of `Scenario`, without `passing`.
         """
         with self._lock:

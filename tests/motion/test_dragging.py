@@ -200,15 +200,15 @@ def beside_goal(nominal, distance):
     return Sphere((float(x), float(y), float(z)), 0.15)
 
 
-def test_a_stance_is_kept_while_it_leaves_as_many_starts_free(engine, robot, initial):
+def test_a_reference_posture_is_kept_while_it_leaves_as_many_starts_free(engine, robot, initial):
     nominal, follower = engine.nominal(initial("push_box")), Follower(robot)
     near, farther = (ArmAvoidance((beside_goal(nominal, distance),)) for distance in (0.11, 0.2))
-    stance = follower.admission(nominal, near).nominal.stance
-    assert stance is not None and follower.admission(nominal, farther).nominal.stance is None
-    assert follower.admission(nominal, farther, stance).nominal.stance == stance
+    posture = follower.admission(nominal, near).nominal.posture
+    assert posture is not None and follower.admission(nominal, farther).nominal.posture is None
+    assert follower.admission(nominal, farther, posture).nominal.posture == posture
 
 
-def test_a_stance_is_kept_only_while_something_is_in_the_way(engine, robot, initial):
+def test_a_reference_posture_is_kept_only_while_something_is_in_the_way(engine, robot, initial):
     nominal, follower = engine.nominal(initial("push_box")), Follower(robot)
     ball = beside_goal(nominal, 0.11)
     scenario = changed(initial("push_box"), obstacles=ball, space="cspace")
@@ -216,20 +216,20 @@ def test_a_stance_is_kept_only_while_something_is_in_the_way(engine, robot, init
     solved = solve(scenario, other, LIVE, follower)
     x, y, z = ball.position
     moved, away = (changed(scenario, obstacles=ball.moved((x, y, z + by))) for by in (0.005, 0.5))
-    assert solved.passing.goes_on(moved.obstacles) and solved.passing.stance == other.stance is not None
+    assert solved.passing.goes_on(moved.obstacles) and solved.passing.posture == other.posture is not None
     assert not solved.passing.goes_on(away.obstacles) and not ANEW.goes_on(moved.obstacles)
 
 
-def test_an_engine_keeps_the_stance_that_it_shows_while_an_obstacle_is_dragged(new_engine, initial):
+def test_an_engine_keeps_the_posture_that_it_shows_while_an_obstacle_is_dragged(new_engine, initial):
     engine = new_engine()
     nominal = engine.nominal(initial("push_box"))
     balls = [beside_goal(nominal, distance) for distance in np.arange(0.11, 0.205, 0.01)]
     scenarios = [changed(initial("push_box"), obstacles=ball, space="cspace", view=NOTHING_DRAWN) for ball in balls]
     frames = dragged(engine, scenarios)
-    stances = [engine.solved(frame.scenario, LIVE).nominal.stance for frame in frames]
+    reference_postures = [engine.solved(frame.scenario, LIVE).nominal.posture for frame in frames]
     assert not any(frame.blocked for frame in frames)
-    assert stances[0] is not None and set(stances) == {stances[0]}
-    assert new_engine().solved(scenarios[-1], LIVE).nominal.stance != stances[0]
+    assert reference_postures[0] is not None and set(reference_postures) == {reference_postures[0]}
+    assert new_engine().solved(scenarios[-1], LIVE).nominal.posture != reference_postures[0]
 
 
 @pytest.mark.parametrize("seed", [3, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(4, 9))])
@@ -240,7 +240,7 @@ def test_motions_change_no_faster_than_the_obstacle_moves(new_engine, initial, s
     through = task.mean_path[round(rng.uniform(0.3, 0.7) * 100)]
     direction = rng.normal(size=3)
     direction /= np.linalg.norm(direction)
-    before = stance = None
+    before = posture = None
     balls = [Sphere(as_point(through + step * direction), 0.15) for step in np.arange(-0.02, 0.02, 1e-3)]
     for frame in dragged(
         engine, [changed(initial("push_box"), obstacles=ball, space="cspace", view=NOTHING_DRAWN) for ball in balls]
@@ -248,12 +248,12 @@ def test_motions_change_no_faster_than_the_obstacle_moves(new_engine, initial, s
         scenario, ball = frame.scenario, frame.scenario.obstacles[0]
         assert not frame.blocked
         arm = engine.solved(scenario, LIVE).arm
-        if before is not None and engine.solved(scenario, LIVE).nominal.stance == stance:
+        if before is not None and engine.solved(scenario, LIVE).nominal.posture == posture:
             assert abs(arm.duration - before.duration) <= 1.001e-3 * DURATION_CHANGE
             for way, last in zip(arm.detours, before.detours, strict=True):
                 if way is not None and last is not None:
                     assert way.direction @ last.direction > np.cos(1.1 * DETOUR.turning * 1e-3 / ball.radius)
-        before, stance = arm, engine.solved(scenario, LIVE).nominal.stance
+        before, posture = arm, engine.solved(scenario, LIVE).nominal.posture
 
 
 def test_after_a_drag_other_settings_act_at_once(new_engine, initial):

@@ -68,7 +68,7 @@ class TestAdmission:
     def test_nothing_is_in_the_way_of_what_has_to_be_avoided(self, follower, nominal, initial):
         for obstacles in (initial("push_box").obstacles, (FAR,), ()):
             admission = self.admission(follower, nominal, *obstacles)
-            assert admission.nominal == nominal and not admission.blocked  # in its usual stance, too
+            assert admission.nominal == nominal and not admission.blocked  # with its usual posture, too
 
     def test_a_covered_start_is_left_out_and_named(self, follower, nominal):
         away = np.linalg.norm(nominal.task.starts - nominal.task.starts[2], axis=1)
@@ -120,7 +120,7 @@ class TestAdmission:
                 follower.undisturbed(nominal)
 
 
-class TestStance:
+class TestReferencePosture:
     """A ball beside the goal, which the hand clears and the arm at rest there does not."""
 
     @pytest.fixture(name="beside", params=["push_box", "drop_pots"])
@@ -139,8 +139,8 @@ class TestStance:
         nominal, avoidance = beside
         assert self.truth(follower.undisturbed(nominal).pins, avoidance).min() < 0  # so there is something to do
         found = follower.admission(nominal, avoidance)
-        assert not found.blocked and found.nominal.moving.all() and found.nominal.stance is not None
-        assert Follower(robot).admission(nominal, avoidance).nominal.stance == found.nominal.stance
+        assert not found.blocked and found.nominal.moving.all() and found.nominal.posture is not None
+        assert Follower(robot).admission(nominal, avoidance).nominal.posture == found.nominal.posture
         lifted = follower.undisturbed(found.nominal)
         assert self.truth(lifted.pins, avoidance).min() >= avoidance.margin - 1e-3
         np.testing.assert_allclose(robot.end_effector(lifted.pins), nominal.ends, rtol=0, atol=1e-5)
@@ -155,23 +155,23 @@ class TestStance:
         again = Section(robot, lifted.reference).postures(robot.end_effector(q))
         np.testing.assert_allclose(again, q, rtol=0, atol=1e-3)
 
-    def test_the_meshes_keep_clear_of_each_other_in_all_stances(self, follower, beside):
-        known, model = follower.stances(beside[0].learned), load_collision_model()
-        for stance in range(0, len(known.references), 20):
-            near = [model.nearest_to_itself(q) for q in (known.on_path[stance], *known.at_starts[stance][:, None])]
+    def test_the_meshes_keep_clear_of_each_other_with_all_reference_postures(self, follower, beside):
+        known, model = follower.reference_postures(beside[0].learned), load_collision_model()
+        for posture in range(0, len(known.references), 20):
+            near = [model.nearest_to_itself(q) for q in (known.on_path[posture], *known.at_starts[posture][:, None])]
             assert all(nearest is None or nearest.distance >= SELF_MARGIN for nearest in near)
 
     def test_the_motion_ends_at_the_goal_around_the_obstacle(self, engine, beside, robot):
         nominal, avoidance = beside
         scenario = changed(Scenario(nominal.task.name), obstacles=avoidance.avoided.parts, space="cspace")
         solved = engine.solved(scenario, FINE)
-        assert solved.cleared and solved.nominal.stance is not None
+        assert solved.cleared and solved.nominal.posture is not None
         rows = np.r_[np.diff(solved.arm.index) > 0, True]
         hand = robot.end_effector(solved.arm.p[rows])
         np.testing.assert_allclose(hand, np.broadcast_to(nominal.goal, hand.shape), rtol=0, atol=1e-4)
         assert self.truth(solved.arm.p[::7], avoidance).min() >= avoidance.margin - 1e-3
 
-    def test_joints_for_the_eye_are_of_the_same_stance_as_exact_ones(self, follower, beside):
+    def test_joints_for_the_eye_are_of_the_same_posture_as_exact_ones(self, follower, beside):
         nominal, avoidance = beside
         standing = follower.admission(nominal, avoidance).nominal
         solution = build_stack(nominal, (), LIVE)
@@ -204,7 +204,7 @@ class Lift:
         self.monkeypatch.setattr(arm, "avoiding", through)
 
     def is_usual(self, lifted):
-        """Whether the arm keeps the stance that it has without obstacles."""
+        """Whether the arm keeps the reference posture that it has without obstacles."""
         return np.array_equal(lifted.reference, self.follower.reference(self.nominal))
 
     def solved(self, scenario=None, precision=LIVE, passing=None):
@@ -218,19 +218,19 @@ def _lift(engine, follower, initial, monkeypatch):
 
 
 class TestNoWay:
-    def test_other_stances_are_tried_where_the_usual_one_has_no_way(self, lift):
+    def test_other_postures_are_tried_where_the_usual_one_has_no_way(self, lift):
         usual = lift.solved()
         assert usual.nominal is lift.nominal and usual.cleared
         lift.spoil(lift.is_usual, stuck=np.arange(7) == 0)
         other = lift.solved()
-        assert other.cleared and other.nominal.stance is not None
+        assert other.cleared and other.nominal.posture is not None
         # what is asked for by hand is done as it is asked for
         assert lift.solved(changed(lift.scenario, duration=0.3)).nominal is lift.nominal
 
-    def test_other_stances_are_tried_where_the_way_is_long_but_not_in_a_drag(self, lift):
+    def test_other_postures_are_tried_where_the_way_is_long_but_not_in_a_drag(self, lift):
         lift.spoil(lift.is_usual, duration=1.01 * LONG)
         other = lift.solved()
-        assert other.cleared and other.nominal.stance is not None
+        assert other.cleared and other.nominal.posture is not None
         arm = lift.avoiding(other.lifted, lift.scenario.arm_avoidance, LIVE.spacing, coarse=True)
         x, y, z = lift.scenario.obstacle.parts[0].position
         moved = changed(lift.scenario, obstacles=Sphere((x, y, z + 0.003)))
