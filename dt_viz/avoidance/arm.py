@@ -241,7 +241,7 @@ def _detours(
     known: Sequence[Detour | None],
     attempts: Sequence[int],
 ) -> tuple[Detour | None, ...]:
-    """The detours on these of the sides, or on their way there from those that are carried over.
+    """Make detours to these of the sides, or turning to them from those that are carried over.
 
     Args:
         avoidance: whose detours they are.

@@ -1,4 +1,4 @@
-"""Detours: the way out of an obstacle that all motions around it take, and how it changes while that is dragged.
+"""Detours: the escape from an obstacle that all motions around it take, and how it changes while that is dragged.
 
 The motions of a hand (a body of one point) and of an arm (a body of many) choose alike: of all directions that with the
 least detour, and the one that was chosen before while that costs little more. In a drag it turns at a limited rate.
@@ -27,7 +27,7 @@ OPPOSITE = -0.7
 
 @dataclass(frozen=True)
 class DetourSettings:
-    """Choice of the way out of an obstacle.
+    """Choice of the escape from an obstacle.
 
     Raises:
         FormatError: a number is negative or huge, or one is 0 that divides, or there are too few or many directions.
@@ -42,9 +42,9 @@ class DetourSettings:
     turning: float = 5.0
     """Angle, rad, by which a detour turns while its obstacle moves by its radius."""
     on_the_way: float = 0.10
-    """Length of an escape, metres, beyond which nothing new is in its way: the arm also turns as it moves."""
+    """Length of an escape, metres, beyond which nothing else obstructs it: the arm also turns as it moves."""
     seconds_ahead: float = 1.5
-    """Time for which a moving obstacle is in the way also of where it will be, s."""
+    """Time for which the predicted poses of a moving obstacle count as occupied, s."""
     metres_ahead: float = 0.16
     """Largest distance of these places from where it is, metres."""
     stride: float = 0.04
@@ -131,7 +131,7 @@ def directions_around(plane: Array | None, num: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Detour:
-    """The way out of one obstacle that the motions around it take."""
+    """The escape from one obstacle that the motions around it take."""
 
     obstacle: Obstacle
     side: Array

@@ -36,10 +36,10 @@ ACCEPTED_MARGIN = 0.9
 BESIDE = 1e-3
 """Tolerance of the surface of an obstacle, metres, which is known approximately; also of a covered start's depth."""
 NUM_DIRECTIONS = 360
-"""Number of directions of a plane in which a way out of obstacles is searched."""
+"""Number of directions of a plane in which the nearest free place is searched."""
 TAIL = 2.0
 """Length of the end of a path to a covered goal that may be inside, in distances from the goal to the nearest free
-place: such a path arrives at up to 60° from the straight way out."""
+place: such a path arrives at up to 60° from the straight escape."""
 
 
 @dataclass(frozen=True, init=False)
@@ -136,7 +136,7 @@ class HandAvoidance(Avoidance, Planar, space="task"):
 
         Further attempts take those of the first, with the motion before them: for starts that the flows have moved into
         the obstacle they would be longer, and move these farther. A flow time by hand is spent on these first. In a
-        plane no way out turns from one side to the other, so none is carried over there. The paper's generator acts
+        plane no escape turns from one side to the other, so none is carried over there. The paper's generator acts
         alone.
         """
         if motion.earlier is not None:

@@ -128,7 +128,7 @@ class Encounter:
         """Choose the side with the least detour, or the previous one while that costs little more.
 
         Where turning there at a limited rate would move the motions farther than going there at once, it is there at
-        once: what has just come near may make the way long in between.
+        once: what has just come near may make the detours in between long.
 
         Args:
             previous: the detour that is carried over from the obstacle's last pose; None where there was none.
