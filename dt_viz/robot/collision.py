@@ -103,7 +103,7 @@ class _MotionPieces(NamedTuple):
 
     def take(self, which: NDArray[np.bool_]) -> _MotionPieces:
         """Select some of them."""
-        return _MotionPieces(*(field[which] for field in self))
+        return _MotionPieces._make(field[which] for field in self)
 
     def lower(self) -> Array:
         """Compute lower bounds (P,) of the distances anywhere on the pieces."""
@@ -155,7 +155,7 @@ class _Search:
         second = self._travel_to(end, item) - self._travel_to(middle, item)
         at_middle = self._measured(middle, item, np.maximum(first, second))
         halves = (start, middle, item, at_start, at_middle, first), (middle, end, item, at_middle, at_end, second)
-        return _MotionPieces(*map(np.concatenate, zip(*halves, strict=True)))
+        return _MotionPieces._make(map(np.concatenate, zip(*halves, strict=True)))
 
     def _travel_to(self, places: Array, items: Indices) -> Array:
         """Return the distances (N,) that the items (N,) have moved up to places (N,)."""
