@@ -168,7 +168,7 @@ class DistanceGrid:
         """Values (N,) at points `s` (N, 3); complex numbers are ordered by their real parts."""
         shape = np.array(self.values.shape)[:, None]
         t = (s.T - self.origin[:, None]) / self.cell  # the batch last, for long inner loops
-        clipped = np.minimum(np.maximum(t, 0.5), shape - 1.5)
+        clipped: Array = np.minimum(np.maximum(t, 0.5), shape - 1.5)
         node = np.minimum((clipped.real + 0.5).astype(np.intp), shape - 2)
         f = clipped - node  # from −1/2 to 1/2
         flat, around = self._coefficients
