@@ -339,5 +339,10 @@ def _magnitude(x: Array) -> Array:
 
 def _beyond_faces(*excess: Array) -> Array:
     """Return the signed distance from a box, given the excesses of coordinates over its half sizes."""
-    inside, beyond = np.maximum.reduce(excess), np.maximum(excess, 0.0)  # complex numbers: by their real parts
-    return np.where(inside.real > 0, np.sqrt((beyond * beyond).sum(axis=0)), inside)
+    inside, squared = excess[0], np.zeros(())
+    for x in excess[1:]:
+        inside: Array = np.where(x.real > inside.real, x, inside)
+    for x in excess:
+        beyond: Array = np.where(x.real > 0, x, 0.0)
+        squared = squared + beyond * beyond
+    return np.where(inside.real > 0, np.sqrt(squared), inside)

@@ -27,7 +27,8 @@ class Union:
         """
         nearest: Array = np.full(s.shape[:-1], np.inf, dtype=s.dtype)
         for part in self.parts:
-            nearest = np.minimum(nearest, part.signed_distance(s))  # complex numbers: by their real parts
+            distance = part.signed_distance(s)
+            nearest = np.where(distance.real < nearest.real, distance, nearest)
         return nearest
 
     def distance_and_normal(self, s: Array) -> tuple[Array, Array]:
