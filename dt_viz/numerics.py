@@ -1,6 +1,15 @@
-"""Numerical zeros, and divisions by lengths that may be zero."""
+"""Types of arrays, numerical zeros, and divisions by lengths that may be zero."""
+
+from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.floating[Any]]
+Indices = NDArray[np.integer[Any]]
+Mask = NDArray[np.bool_]
 
 ZERO = 1e-12
 """Length below which a vector counts as zero, and least divisor, in the unit of its coordinates (m, s, rad)."""

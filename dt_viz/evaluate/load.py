@@ -58,7 +58,6 @@ from dt_viz.evaluate.protocol_client import ANSWERED, ROLLOUT, LostError, Protoc
 from dt_viz.flows.fields import Array
 from dt_viz.obstacles.shapes import Point, as_point
 from dt_viz.scenario.tasks import Task
-from dt_viz.ui.panel import OFF, SPACES
 
 
 @dataclass(frozen=True)
@@ -144,8 +143,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the command's arguments."""
     parser.add_argument("--task", default="draw_s", help="that the server begins with (default: %(default)s)")
     add_lasa(parser)
-    modes = tuple(mode.lower() for mode in (*SPACES, OFF))
-    parser.add_argument("--avoid", choices=modes, help="what gives way; as the page opens unless given")
+    parser.add_argument(
+        "--avoid", choices=("hand", "arm", "off"), help="what gives way; as the page opens unless given"
+    )
     parser.add_argument(
         "--clients", type=whole_number(1), nargs="+", default=(1, 2, 4, 8, 16), help="visitors at once, in turn"
     )

@@ -40,7 +40,7 @@ from dt_viz.evaluate.options import (
     write_npz,
 )
 from dt_viz.flows.fields import Array
-from dt_viz.metrics import resample_by_arc_length
+from dt_viz.metrics import interpolate, resample_by_arc_length
 from dt_viz.motion.following import Follower
 from dt_viz.motion.solve import Solved
 from dt_viz.motion.stack import LIVE
@@ -108,7 +108,7 @@ class Passage:
         if not self.comes <= t < self.gone:
             return np.full(3, np.nan)
         place = (t - self.comes) * self.speed / self.length * (len(self.path) - 1)
-        return np.array([np.interp(place, np.arange(len(self.path)), axis) for axis in self.path.T])
+        return interpolate(np.array([place]), np.arange(len(self.path)), self.path)[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,36 +144,6 @@ class Run:
     phases: set[Phase] = field(default_factory=set)
 
 
-class Arm:
-    """The robot, driven by the controller, which looks at the obstacles now and then."""
-
-    def __init__(self, bench: Bench, crossing: Crossing) -> None:
-        self._bench, self.controller = bench, ArmController(bench.follower, bench.solved)
-        self.controller.begin(bench.starts[crossing.start], crossing.start)
-        self.controller.home(crossing.start)
-        self._looks, self._went, self._present = 0.0, False, True
-
-    def tick(self, t: float, q: Array, crossing: Crossing, run: Run) -> Array:
-        """Joint velocities (6,), rad/s, at t."""
-        if not self._went and t >= crossing.begins:
-            self.controller.go()
-            self._went = True
-        parts = self._bench.obstacles(crossing, t)
-        if t >= self._looks and (parts or self._present):
-            self._present, self._looks = bool(parts), t + SETTINGS.look_period
-            self.controller.see(self._bench.avoidance(parts))
-        began = time.thread_time()
-        velocity = self.controller.step(q, TICK)
-        run.ticks.append(time.thread_time() - began)
-        run.phases.add(self.controller.phase)
-        return velocity
-
-    @property
-    def resting(self) -> bool:
-        """Whether it is at the goal."""
-        return self._went and not self._present and self.controller.phase is Phase.RESTING
-
-
 class Bench:
     """A task's robot."""
 
@@ -204,10 +174,6 @@ class Bench:
         """Those that are there at a time."""
         places = zip(crossing.passages, crossing.at(t), strict=True)
         return tuple(self.shape(place, passage.wxyz) for passage, place in places if np.isfinite(place[0]))
-
-    def avoidance(self, obstacles: tuple[Obstacle, ...]) -> ArmAvoidance | None:
-        """What the whole arm is to avoid."""
-        return ArmAvoidance(obstacles, margin=self.margin)
 
     def undisturbed(self, start: int) -> tuple[Array, Array]:
         """The hand's places (T, 3), metres, and joints (T, 6) at all ticks without a sphere."""
@@ -277,16 +243,32 @@ def _path(middle: Array, rng: np.random.Generator) -> Array:
 
 
 def simulated(bench: Bench, crossing: Crossing) -> Run:
-    """Run the arm until it rests at the goal, or so many seconds after the obstacles have gone."""
-    arm, run, q = Arm(bench, crossing), Run(), bench.starts[crossing.start].copy()
+    """Run the arm until it rests at the goal, or so many seconds after the obstacles have gone.
+
+    The controller looks at the obstacles now and then.
+    """
+    controller, run, q = ArmController(bench.follower, bench.solved), Run(), bench.starts[crossing.start].copy()
+    controller.begin(q, crossing.start)
+    controller.home(crossing.start)
+    looks, went, present = 0.0, False, True
     for k in range(int((crossing.gone + crossing.begins + SETTINGS.longest) / TICK)):
         t = k * TICK
         run.q.append(q)
         run.t.append(t)
         run.obstacle.append(crossing.at(t))
-        if t > max(crossing.gone, crossing.begins) and arm.resting:
+        if t > crossing.gone and went and not present and controller.phase is Phase.RESTING:
             break
-        q = q + TICK * arm.tick(t, q, crossing, run)
+        if not went and t >= crossing.begins:
+            controller.go()
+            went = True
+        parts = bench.obstacles(crossing, t)
+        if t >= looks and (parts or present):
+            present, looks = bool(parts), t + SETTINGS.look_period
+            controller.see(ArmAvoidance(parts, margin=bench.margin))
+        began = time.thread_time()
+        q = q + TICK * controller.step(q, TICK)
+        run.ticks.append(time.thread_time() - began)
+        run.phases.add(controller.phase)
     return run
 
 
@@ -302,38 +284,19 @@ def room_at_coming(bench: Bench, run: Run, crossing: Crossing) -> float:
 
 
 def smallest_distance(bench: Bench, run: Run, crossing: Crossing) -> float:
-    """Smallest distance of the arm's meshes from the obstacles, also between ticks, metres."""
-    q, places = np.array(run.q), np.array(run.obstacle)
-    found = np.inf
-    for passage, centres in zip(crossing.passages, places.transpose(1, 0, 2), strict=True):
-        there = np.isfinite(centres[:, 0])
-        found = min(found, _smallest_distance(bench, q[there], centres[there], passage.wxyz))
-    return found
-
-
-def _smallest_distance(bench: Bench, q: Array, places: Array, wxyz: Quaternion) -> float:
-    """The same from one obstacle at places (T, 3), metres, at joints q (T, 6), rad."""
+    """Smallest distance of the arm's meshes from the obstacles, at the ticks and at five places between two, metres."""
     cover, model, best = bench.follower.body, load_collision_model(), np.inf
-    points, still = cover.positions(bench.robot, q), bench.shape(np.zeros(3), wxyz)
-
-    def measured(joints: Array, place: Array) -> float:
-        return float(model.obstacle_distance(joints[None], bench.shape(place, wxyz))[0][0])
-
-    gaps = (still.signed_distance(points - places[:, None]) - cover.radius).min(axis=1)
-    for k in np.argsort(gaps):  # the spheres cover the meshes: their distances are lower bounds
-        if gaps[k] >= best:
-            break
-        best = min(best, measured(q[k], places[k]))
-    # between ticks no covering sphere and the obstacle move towards each other by more than both move
-    travel = np.linalg.norm(np.diff(points, axis=0), axis=2).max(axis=1) + np.linalg.norm(
-        np.diff(places, axis=0), axis=1
-    )
-    for k in np.flatnonzero(np.minimum(gaps[:-1], gaps[1:]) - travel / 2 < best):
-        for u in np.linspace(0, 1, 7)[1:-1]:
-            joints, place = (1 - u) * q[k] + u * q[k + 1], (1 - u) * places[k] + u * places[k + 1]
-            near = still.signed_distance(cover.positions(bench.robot, joints) - place) - cover.radius
-            if near.min() < best:
-                best = min(best, measured(joints, place))
+    for passage, centres in zip(crossing.passages, np.array(run.obstacle).transpose(1, 0, 2), strict=True):
+        (there,) = np.nonzero(np.isfinite(centres[:, 0]))
+        finely = np.linspace(there[0], there[-1], 6 * (len(there) - 1) + 1)
+        q, places = (interpolate(finely, there, values[there]) for values in (np.array(run.q), centres))
+        points = cover.positions(bench.robot, q) - places[:, None]
+        gaps = bench.shape(np.zeros(3), passage.wxyz).signed_distance(points) - cover.radius
+        bounds = gaps.min(axis=1)  # the spheres cover the meshes
+        for k in np.argsort(bounds):
+            if bounds[k] >= best:
+                break
+            best = min(best, float(model.obstacle_distance(q[[k]], bench.shape(places[k], passage.wxyz))[0][0]))
     return best
 
 

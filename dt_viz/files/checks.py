@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dt_viz.errors import FormatError
-from dt_viz.flows.fields import Array, Indices
+from dt_viz.numerics import Array, Indices
 
 MAX_FACES = 500_000
 """Largest number of triangles of a mesh."""

@@ -13,7 +13,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from dt_viz.errors import FormatError
-from dt_viz.flows.fields import Array, Indices, Mask
+from dt_viz.numerics import Array, Indices, Mask
 
 
 def repaired(vertices: Array, faces: Indices) -> tuple[Array, Indices, tuple[str, ...]]:

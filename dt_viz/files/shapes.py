@@ -20,7 +20,7 @@ from dt_viz.errors import FormatError
 from dt_viz.files.checks import MAX_FACES, check_at_most, check_triangles, too_many
 from dt_viz.files.npz import arrays_of
 from dt_viz.files.repair import repaired
-from dt_viz.flows.fields import Array, Indices
+from dt_viz.numerics import Array, Indices
 
 
 @dataclass(frozen=True)

@@ -5,18 +5,15 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from dt_viz.kernels.dormand_prince import RATE
 from dt_viz.kernels.fields import GRID, TERM, Terms
 from dt_viz.kernels.flows import carry
-
-Array = NDArray[np.floating[Any]]
-Indices = NDArray[np.integer[Any]]
-Mask = NDArray[np.bool_]
+from dt_viz.numerics import Array, Indices, Mask  # noqa: F401 - other packages import them with the fields
 
 
 class VectorField(Protocol):

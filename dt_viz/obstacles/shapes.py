@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -40,32 +41,49 @@ def as_quaternion(v: Array) -> Quaternion:
     return w, x, y, z
 
 
-class Obstacle(Protocol):
-    """A solid somewhere in the world: an immutable value, cheap to move."""
+class Obstacle(ABC):
+    """A solid somewhere in the world: an immutable value, cheap to move.
+
+    A shape gives its distance, map and cover in a frame of its own.
+    """
+
+    position: Point
+    """Origin of its own frame in the world, metres."""
+    wxyz: Quaternion
+    """Unit quaternion that turns its own frame into the world's."""
+    scale: float = 1.0
+    """Length of one unit of its own frame, metres."""
 
     @property
-    def position(self) -> Point:
-        """Origin of its own frame in the world, metres."""
-        ...
-
-    @property
-    def wxyz(self) -> Quaternion:
-        """Unit quaternion that turns its own frame into the world's."""
-        ...
-
-    @property
+    @abstractmethod
     def radius(self) -> float:
         """Radius of the ball around `position` that holds it, metres."""
-        ...
 
     @property
+    @abstractmethod
     def depth(self) -> float:
         """Distance of its deepest point from the surface, metres."""
-        ...
+
+    @abstractmethod
+    def surface(self) -> tuple[Array, Indices]:
+        """Return the drawn mesh: vertices (V, 3), metres, in its own frame, and faces (F, 3), outward."""
+
+    @abstractmethod
+    def _distance(self, own: Array) -> Array:
+        """Compute signed distances (*B,) of points (*B, 3), both in its own frame."""
+
+    @abstractmethod
+    def _map(self) -> tuple[OccupancyMap, Array, Array]:
+        """Return the map of its occupancy in a frame u, and axes A (3, 3) and centre c (3,): own frame = A·u + c."""
+
+    @abstractmethod
+    def _cover(self) -> tuple[Array, Array]:
+        """Cover it by balls, centres (K, 3) and radii (K,), both in its own frame."""
 
     def moved(self: T, position: Point, wxyz: Quaternion = UPRIGHT) -> T:
         """Return the same shape somewhere else."""
-        ...
+        changes: Any = {"position": position, "wxyz": wxyz}
+        return replace(self, **changes)  # pyright: ignore[reportArgumentType]
 
     def signed_distance(self, s: Array) -> Array:
         """Distance of the points `s` (*B, 3) from the surface, (*B,), metres, negative inside.
@@ -73,108 +91,64 @@ class Obstacle(Protocol):
         Its slope is nowhere above 1 (of triangles, by two percent in places). Analytic in `s`: derivatives by complex
         steps are exact.
         """
-        ...
+        return self.scale * self._distance((s - np.asarray(self.position)) @ rotation(self.wxyz) / self.scale)
 
     def field(self, generator: Generator, temperature: float) -> PlacedField:
         """Return the generator whose reverse flow leaves the shape, learned once for all its places."""
-        ...
+        occupancy, axes, centre = self._map()
+        local, turned = AvoidanceField(occupancy, generator, temperature), self.scale * rotation(self.wxyz) @ axes
+        return PlacedField(local, self._to_world(centre), turned)
 
     def cover(self) -> tuple[Array, Array]:
         """Cover the shape by balls: centres (K, 3) in the world and radii (K,), metres, K ≤ `MAX_BALLS`."""
-        ...
+        centres, radii = self._cover()
+        return self._to_world(centres), self.scale * radii
 
-    def surface(self) -> tuple[Array, Indices]:
-        """Return the drawn mesh: vertices (V, 3), metres, in its own frame, and faces (F, 3), outward."""
-        ...
-
-
-class _Turned:
-    """Base of shapes that are given in a frame of their own."""
-
-    position: Point
-    wxyz: Quaternion
-
-    def moved(self: T, position: Point, wxyz: Quaternion = UPRIGHT) -> T:
-        """See `Obstacle`."""
-        return replace(self, position=position, wxyz=wxyz)  # pyright: ignore[reportArgumentType, reportCallIssue]
-
-    def _to_own(self, s: Array) -> Array:
-        return (s - np.asarray(self.position)) @ rotation(self.wxyz)
-
-    def _to_world(self, s: Array) -> Array:
-        return s @ rotation(self.wxyz).T + np.asarray(self.position)
-
-    def _placed(
-        self,
-        occupancy: OccupancyMap,
-        generator: Generator,
-        temperature: float,
-        axes: Array,
-        centre: Array | float = 0.0,
-        scale: float = 1.0,
-    ) -> PlacedField:
-        """Return the field of a map in a frame u; u ↦ axes·u + centre gives this shape's own frame.
-
-        Metres of the world are `scale` times the units of the own frame.
-        """
-        local = AvoidanceField(occupancy, generator, temperature)
-        return PlacedField(local, self._to_world(np.zeros(3) + centre), scale * rotation(self.wxyz) @ axes)
+    def _to_world(self, own: Array) -> Array:
+        return self.scale * own @ rotation(self.wxyz).T + np.asarray(self.position)
 
 
 @dataclass(frozen=True)
-class Sphere:
+class Sphere(Obstacle):
     """A ball. Raises FormatError, as other shapes, where its size makes no sense."""
 
     position: Point
     """Centre, metres."""
     diameter: float = 0.15
     """Diameter, metres."""
+    wxyz = UPRIGHT  # a ball looks the same in any orientation
 
     def __post_init__(self) -> None:
         check_between("diameter", self.diameter, SMALLEST, LARGEST)
 
     @property
-    def wxyz(self) -> Quaternion:
-        """Identity: a ball looks the same in any orientation."""
-        return UPRIGHT
-
-    @property
     def radius(self) -> float:
-        """Radius, metres."""
         return self.diameter / 2
 
     @property
     def depth(self) -> float:
-        """See `Obstacle`."""
         return self.radius
 
     def moved(self, position: Point, wxyz: Quaternion = UPRIGHT) -> Sphere:
-        """See `Obstacle`."""
         return Sphere(position, self.diameter)
 
-    def signed_distance(self, s: Array) -> Array:
-        """Distance of the points `s` (*B, 3) from the surface, (*B,), metres, negative inside; analytic in `s`."""
-        offset = s - np.asarray(self.position)
-        return np.sqrt((offset * offset).sum(axis=-1)) - self.radius
-
-    def field(self, generator: Generator, temperature: float) -> PlacedField:
-        """See `Obstacle`: from one occupancy map for all spheres."""
-        local = AvoidanceField(unit_map(Sphere(ORIGIN, 2.0)), generator, temperature)
-        return PlacedField(local, np.asarray(self.position), self.radius * np.eye(3))
-
-    def cover(self) -> tuple[Array, Array]:
-        """See `Obstacle`."""
-        return np.array([self.position]), np.array([self.radius])
-
     def surface(self) -> tuple[Array, Indices]:
-        """See `Obstacle`."""
         turn = np.linspace(0, np.pi, 25)
         vertices, faces = lathe(list(zip(np.sin(turn), -np.cos(turn), strict=True)))
         return self.radius * vertices, faces
 
+    def _distance(self, own: Array) -> Array:
+        return np.sqrt((own * own).sum(axis=-1)) - self.radius
+
+    def _map(self) -> tuple[OccupancyMap, Array, Array]:
+        return unit_map(Sphere(ORIGIN, 2.0)), self.radius * np.eye(3), np.zeros(3)
+
+    def _cover(self) -> tuple[Array, Array]:
+        return np.zeros((1, 3)), np.array([self.radius])
+
 
 @dataclass(frozen=True)
-class Box(_Turned):
+class Box(Obstacle):
     """A box; a cube where its sizes are equal."""
 
     position: Point
@@ -193,38 +167,29 @@ class Box(_Turned):
 
     @property
     def radius(self) -> float:
-        """Half the diagonal, metres."""
         return float(np.linalg.norm(self._half))
 
     @property
     def depth(self) -> float:
-        """See `Obstacle`."""
         return float(self._half.min())
 
-    def signed_distance(self, s: Array) -> Array:
-        """See `Obstacle`."""
-        own = self._to_own(s)
+    def surface(self) -> tuple[Array, Indices]:
+        return box_surface(self._half)
+
+    def _distance(self, own: Array) -> Array:
         x, y, z = (_magnitude(own[..., i]) - self._half[i] for i in range(3))
         return _beyond_faces(x, y, z)
 
-    def field(self, generator: Generator, temperature: float) -> PlacedField:
-        """See `Obstacle`."""
-        unit = unit_sizes(self._half)
-        x, y, z = (2 * half for half in unit)
-        return self._placed(unit_map(Box(ORIGIN, (x, y, z))), generator, temperature, np.diag(self._half / unit))
+    def _map(self) -> tuple[OccupancyMap, Array, Array]:
+        x, y, z = unit = unit_sizes(self._half)
+        return unit_map(Box(ORIGIN, (2 * x, 2 * y, 2 * z))), np.diag(self._half / unit), np.zeros(3)
 
-    def cover(self) -> tuple[Array, Array]:
-        """See `Obstacle`."""
-        centres, radii = box_cover(self._half)
-        return self._to_world(centres), radii
-
-    def surface(self) -> tuple[Array, Indices]:
-        """See `Obstacle`."""
-        return box_surface(self._half)
+    def _cover(self) -> tuple[Array, Array]:
+        return box_cover(self._half)
 
 
 @dataclass(frozen=True)
-class Cylinder(_Turned):
+class Cylinder(Obstacle):
     """A cylinder along the z axis of its own frame."""
 
     position: Point
@@ -245,50 +210,41 @@ class Cylinder(_Turned):
 
     @property
     def radius(self) -> float:
-        """Half the diagonal, metres."""
         return float(np.hypot(self.diameter, self.height) / 2)
 
     @property
     def depth(self) -> float:
-        """See `Obstacle`."""
         return float(self._half.min())
 
-    def signed_distance(self, s: Array) -> Array:
-        """See `Obstacle`."""
-        own = self._to_own(s)
-        x, y, z = (own[..., i] for i in range(3))
-        return _beyond_faces(np.sqrt(x * x + y * y) - self._half[0], _magnitude(z) - self._half[2])
-
-    def field(self, generator: Generator, temperature: float) -> PlacedField:
-        """See `Obstacle`."""
-        unit = unit_sizes(self._half)
-        return self._placed(
-            unit_map(Cylinder(ORIGIN, 2 * unit[0], 2 * unit[2])), generator, temperature, np.diag(self._half / unit)
-        )
-
-    def cover(self) -> tuple[Array, Array]:
-        """See `Obstacle`."""
-        centres, radii = cylinder_cover(self._half[0], self._half[2])
-        return self._to_world(centres), radii
-
     def surface(self) -> tuple[Array, Indices]:
-        """See `Obstacle`."""
         radius, _, half = self._half
         return lathe([(0, -half), (radius, -half), (radius, half), (0, half)])
 
+    def _distance(self, own: Array) -> Array:
+        x, y, z = (own[..., i] for i in range(3))
+        return _beyond_faces(np.sqrt(x * x + y * y) - self._half[0], _magnitude(z) - self._half[2])
 
-class _Triangles(_Turned):
-    """Base of shapes bounded by triangles; shapes that differ in scale only share what was computed for one."""
+    def _map(self) -> tuple[OccupancyMap, Array, Array]:
+        radius, _, half = unit = unit_sizes(self._half)
+        return unit_map(Cylinder(ORIGIN, 2 * radius, 2 * half)), np.diag(self._half / unit), np.zeros(3)
 
-    scale: float
+    def _cover(self) -> tuple[Array, Array]:
+        return cylinder_cover(self._half[0], self._half[2])
+
+
+class TriangleObstacle(Obstacle):
+    """Base of shapes bounded by triangles; shapes that differ in scale only share what was computed for one.
+
+    Distances are interpolated on a grid, which rounds edges by about a quarter of its cells.
+    """
 
     def __post_init__(self) -> None:
         check_between("scale", self.scale, SMALLEST, 1 / SMALLEST)
 
     @property
+    @abstractmethod
     def solid(self) -> Solid:
         """Enclosed solid in its own frame, before scaling."""
-        raise NotImplementedError
 
     @property
     def size(self) -> float:
@@ -302,41 +258,27 @@ class _Triangles(_Turned):
 
     @property
     def radius(self) -> float:
-        """See `Obstacle`."""
         return self.scale * self.solid.radius
 
     @property
     def depth(self) -> float:
-        """See `Obstacle`."""
         return self.scale * self.solid.distances.depth
 
-    def signed_distance(self, s: Array) -> Array:
-        """See `Obstacle`; interpolated on a grid, which rounds edges by about a quarter of its cells."""
-        return self.scale * self.solid.distances(self._to_own(s))
-
-    def field(self, generator: Generator, temperature: float) -> PlacedField:
-        """See `Obstacle`."""
-        occupancy, axes, centre = solid_map(self.solid)
-        return self._placed(occupancy, generator, temperature, axes, centre, self.scale)
-
-    def cover(self) -> tuple[Array, Array]:
-        """See `Obstacle`."""
-        centres, radii = self.solid.balls
-        return self._to_world(centres), self.scale * radii
-
     def surface(self) -> tuple[Array, Indices]:
-        """See `Obstacle`."""
         return self.scale * self.solid.vertices, self.solid.faces
 
-    def _to_own(self, s: Array) -> Array:
-        return super()._to_own(s) / self.scale
+    def _distance(self, own: Array) -> Array:
+        return self.solid.distances(own)
 
-    def _to_world(self, s: Array) -> Array:
-        return super()._to_world(self.scale * s)
+    def _map(self) -> tuple[OccupancyMap, Array, Array]:
+        return solid_map(self.solid)
+
+    def _cover(self) -> tuple[Array, Array]:
+        return self.solid.balls
 
 
 @dataclass(frozen=True)
-class MeshObstacle(_Triangles):
+class MeshObstacle(TriangleObstacle):
     """An obstacle enclosed by a mesh."""
 
     position: Point
@@ -348,12 +290,11 @@ class MeshObstacle(_Triangles):
 
     @property
     def solid(self) -> Solid:
-        """The mesh."""
         return self.mesh
 
 
 @dataclass(frozen=True)
-class CloudObstacle(_Triangles):
+class CloudObstacle(TriangleObstacle):
     """An obstacle that a point cloud occupies."""
 
     position: Point
@@ -365,7 +306,6 @@ class CloudObstacle(_Triangles):
 
     @property
     def solid(self) -> Solid:
-        """See `Obstacle`."""
         return self.cloud.solid
 
     def labelled(self) -> tuple[Array, Mask]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
@@ -152,16 +153,9 @@ class DistanceGrid:
         point of the border, o = s − c and m the margin, d² = d(c)² + |o|² + 2m·Σ|o_i|; or the distance from the ball
         that holds the shape, whatever is larger.
         """
-        points = np.ascontiguousarray(s.real).reshape(-1, 3)
-        steps = s.imag.reshape(-1, 3) if np.iscomplexobj(s) else None
-        value, slope = self._evaluate(points, slopes=steps is not None)
-        if steps is not None:
-            value = value + 1j * np.einsum("ni,ni->n", slope, steps)
-        return value.reshape(s.shape[:-1])
-
-    def with_slope(self, s: Array) -> tuple[Array, Array]:
-        """Signed distance (N,) of real points `s` (N, 3) and its gradient (N, 3)."""
-        return self._evaluate(s, slopes=True)
+        points, num = s.reshape(-1, 3), 2048  # points whose intermediate results stay in the cache
+        blocks = [self._evaluate(points[i : i + num]) for i in range(0, len(points), num)]
+        return np.concatenate([np.empty(0), *blocks]).reshape(s.shape[:-1])
 
     @cached_property
     def _coefficients(self) -> tuple[Array, Indices]:
@@ -170,60 +164,34 @@ class DistanceGrid:
         around = (np.stack(np.meshgrid(*3 * [[-1, 0, 1]], indexing="ij"), axis=-1) @ strides).ravel()
         return self.values.astype(np.float32).ravel(), around
 
-    def _evaluate(self, s: Array, *, slopes: bool) -> tuple[Array, Array]:
-        """Values (N,), and gradients (N, 3) where they are wanted."""
-        num = 2048  # points whose intermediate results stay in the cache
-        if len(s) > num:
-            blocks = [self._evaluate(s[i : i + num], slopes=slopes) for i in range(0, len(s), num)]
-            values, gradients = zip(*blocks, strict=True)
-            return np.concatenate(values), np.concatenate(gradients)
+    def _evaluate(self, s: Array) -> Array:
+        """Values (N,) at points `s` (N, 3); complex numbers are ordered by their real parts."""
         shape = np.array(self.values.shape)[:, None]
         t = (s.T - self.origin[:, None]) / self.cell  # the batch last, for long inner loops
-        clipped = np.minimum(np.maximum(t, 0.5), shape - 1.5)
-        node = np.minimum((clipped + 0.5).astype(np.intp), shape - 2)
+        clipped: Array = np.minimum(np.maximum(t, 0.5), shape - 1.5)
+        node = np.minimum((clipped.real + 0.5).astype(np.intp), shape - 2)
         f = clipped - node  # from −1/2 to 1/2
         flat, around = self._coefficients
         first = (node[0] * shape[1] + node[1]) * shape[2] + node[2]
         block = flat.take(first + around[:, None]).astype(float).reshape(3, 3, 3, -1)  # (x, y, z, N)
         weights = np.stack([0.5 * (0.5 - f) ** 2, 0.75 - f * f, 0.5 * (0.5 + f) ** 2])  # (3, 3 axes, N)
-        along_z = np.einsum("xyzn,zn->xyn", block, weights[:, 2])
-        along_yz = np.einsum("xyn,yn->xn", along_z, weights[:, 1])
+        along_yz = np.einsum("xyn,yn->xn", np.einsum("xyzn,zn->xyn", block, weights[:, 2]), weights[:, 1])
         value = np.einsum("xn,xn->n", along_yz, weights[:, 0])
-        slope = np.empty((0, 3))
-        if slopes:
-            rates = np.stack([f - 0.5, -2 * f, f + 0.5]) / self.cell
-            rate_y = np.einsum("xyn,yn->xn", along_z, rates[:, 1])
-            rate_z = np.einsum("xyn,yn->xn", np.einsum("xyzn,zn->xyn", block, rates[:, 2]), weights[:, 1])
-            columns = [
-                np.einsum("xn,xn->n", along_yz, rates[:, 0]),
-                np.einsum("xn,xn->n", rate_y, weights[:, 0]),
-                np.einsum("xn,xn->n", rate_z, weights[:, 0]),
-            ]
-            slope = np.stack(columns, axis=-1)
         outside = np.flatnonzero((t != clipped).any(axis=0))
         if len(outside):
-            self._extend((t - clipped).T * self.cell, value, slope, outside)
-        self._raise_to_ball(s, value, slope)
-        return value, slope
-
-    def _extend(self, offset: Array, value: Array, slope: Array, outside: Indices) -> None:
-        """Corrects the values and gradients, in place, of the points outside the grid."""
-        o, g = offset[outside], np.maximum(value[outside], self.margin)
-        size = np.abs(o)
-        far = np.sqrt(g * g + np.einsum("ni,ni->n", o, o) + 2 * self.margin * (size[:, 0] + size[:, 1] + size[:, 2]))
-        value[outside] = far
-        if len(slope):
-            inner = np.where(o == 0, slope[outside], 0.0) * (g > self.margin)[:, None]
-            slope[outside] = (g[:, None] * inner + o + self.margin * np.sign(o)) / far[:, None]
-
-    def _raise_to_ball(self, s: Array, value: Array, slope: Array) -> None:
-        """Raises values, in place, that are smaller than the distance from the ball that holds the shape."""
+            o, inner = self.cell * (t - clipped)[:, outside], np.maximum(value[outside], self.margin)
+            sides = np.maximum(o, -o).sum(axis=0)
+            value[outside] = np.sqrt(inner * inner + (o * o).sum(axis=0) + 2 * self.margin * sides)
         offset = s - self.centre
-        apart = np.sqrt(np.einsum("ni,ni->n", offset, offset))
-        if len(slope):
-            nearer = value < apart - self.radius
-            slope[nearer] = offset[nearer] / apart[nearer, None]
-        np.maximum(value, apart - self.radius, out=value)
+        return np.maximum(value, np.sqrt((offset * offset).sum(axis=1)) - self.radius)
+
+
+def with_slopes(distance: Callable[[Array], Array], s: Array) -> tuple[Array, Array]:
+    """Compute an analytic function (N,) of points `s` (N, 3) and its gradients (N, 3), by complex steps."""
+    step = 1e-20
+    beside: Array = s + 1j * step * np.eye(3)[:, None]  # pyright: ignore[reportAssignmentType]
+    ahead = distance(beside)  # (3, N)
+    return ahead[0].real, ahead.imag.T / step
 
 
 class _Surface:
@@ -332,7 +300,7 @@ def _distances(solid: Solid) -> DistanceGrid:
     grid = DistanceGrid(origin, cell, signed, margin, centre, radius)
     # steeper than 1 by a percent or two beside edges
     s = origin + cell * np.random.default_rng(0).uniform(0.5, counts - 1.5, (100_000, 3))
-    slope = np.sqrt((grid.with_slope(s)[1] ** 2).sum(axis=1).max())
+    slope = np.linalg.norm(with_slopes(grid, s)[1], axis=1).max()
     return replace(grid, values=grid.values / slope, margin=margin / slope) if slope > 1 else grid
 
 

@@ -10,6 +10,7 @@ from dt_viz.flows.fields import Array, Sum
 from dt_viz.numerics import unit
 from dt_viz.obstacles.occupancy import Generator
 from dt_viz.obstacles.shapes import Obstacle
+from dt_viz.obstacles.solids import with_slopes
 from dt_viz.obstacles.surfaces import golden_spiral
 
 
@@ -35,10 +36,8 @@ class Union:
 
         A vector is zero where the distance has no slope; without an obstacle the distance is infinite and all are.
         """
-        step = 1e-20  # imaginary: signed distances are analytic
-        beside: Array = s + 1j * step * np.eye(3)[:, None]  # pyright: ignore[reportAssignmentType]
-        ahead = self.signed_distance(beside)  # (3, N)
-        return ahead[0].real, unit(ahead.imag.T / step)
+        distance, slopes = with_slopes(self.signed_distance, s)
+        return distance, unit(slopes)
 
     def nearest_free(self, s: Array) -> Array:
         """Return the points `s` (*B, 3), those inside moved about to the nearest free place, (*B, 3), metres."""

@@ -14,17 +14,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from dt_viz.obstacles.shapes import Obstacle, Sphere
+from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.union import Union
-from dt_viz.robot.link_distances import (
-    SHAPE_TOLERANCE,
-    AboveTable,
-    BetweenLinks,
-    Link,
-    Measure,
-    Poses,
-    measure_from,
-)
+from dt_viz.robot.link_distances import AboveTable, BetweenLinks, FromObstacle, Link, Measure, Poses
 from dt_viz.robot.robot import NUM_JOINTS, LinkMesh, Robot, collision_meshes, load_jaco
 from dt_viz.warning import ARM, Kind, MotionWarning
 
@@ -34,10 +26,6 @@ if TYPE_CHECKING:
     from dt_viz.flows.fields import Array, Indices
 
 
-TOLERANCE = 1e-4
-"""Largest excess of a reported smallest distance on a path, metres."""
-SELF_TOLERANCE = 1e-3
-"""Largest excess of a reported distance of links from each other, metres."""
 SELF_REACH = 0.05
 """Distance of links beyond which it is not measured, metres: the wrist never has more than 7 cm between its ends."""
 SELF_MARGIN = 0.01
@@ -115,8 +103,7 @@ class _MotionPieces(NamedTuple):
 
     def take(self, which: NDArray[np.bool_]) -> _MotionPieces:
         """Select some of them."""
-        start, end, item, at_start, at_end, travel = self
-        return _MotionPieces(start[which], end[which], item[which], at_start[which], at_end[which], travel[which])
+        return _MotionPieces._make(field[which] for field in self)
 
     def lower(self) -> Array:
         """Compute lower bounds (P,) of the distances anywhere on the pieces."""
@@ -139,11 +126,11 @@ class _Search:
         self._travelled = np.vstack([np.zeros(travel.shape[1]), np.cumsum(travel, axis=0)])  # (T, I) from the start
         self._best, self._place, self._item = ceiling, 0.0, -1
 
-    def run(self, tolerance: float) -> Nearest | None:
-        """Return the smallest distance, at most `tolerance` too large; None if none is below the ceiling."""
+    def run(self) -> Nearest | None:
+        """Return the smallest distance, up to the measure's tolerance; None if none is below the ceiling."""
         pieces = self._first_pieces()
         while self._best > self._measure.lowest:
-            pieces = pieces.take(pieces.lower() < self._best - tolerance)
+            pieces = pieces.take(pieces.lower() < self._best - self._measure.tolerance)
             if not len(pieces.item):
                 break
             pieces = self._halved(pieces)
@@ -158,14 +145,8 @@ class _Search:
         padded = np.pad(travel, [(1, 1), (0, 0)])
         places, items = np.repeat(knots.astype(float), num_items), np.tile(np.arange(num_items), len(knots))
         values = self._measured(places, items, np.maximum(padded[:-1], padded[1:]).ravel())
-        return _MotionPieces(
-            places[:-num_items],
-            places[num_items:],
-            items[num_items:],
-            values[:-num_items],
-            values[num_items:],
-            travel.ravel(),
-        )
+        n = num_items
+        return _MotionPieces(places[:-n], places[n:], items[n:], values[:-n], values[n:], travel.ravel())
 
     def _halved(self, pieces: _MotionPieces) -> _MotionPieces:
         start, end, item, at_start, at_end, _ = pieces
@@ -173,14 +154,8 @@ class _Search:
         first = self._travel_to(middle, item) - self._travel_to(start, item)
         second = self._travel_to(end, item) - self._travel_to(middle, item)
         at_middle = self._measured(middle, item, np.maximum(first, second))
-        return _MotionPieces(
-            np.concatenate([start, middle]),
-            np.concatenate([middle, end]),
-            np.tile(item, 2),
-            np.concatenate([at_start, at_middle]),
-            np.concatenate([at_middle, at_end]),
-            np.concatenate([first, second]),
-        )
+        halves = (start, middle, item, at_start, at_middle, first), (middle, end, item, at_middle, at_end, second)
+        return _MotionPieces._make(map(np.concatenate, zip(*halves, strict=True)))
 
     def _travel_to(self, places: Array, items: Indices) -> Array:
         """Return the distances (N,) that the items (N,) have moved up to places (N,)."""
@@ -248,7 +223,7 @@ class CollisionModel:
             Distances (T,), metres, negative inside; indices (T,) into `links`.
         """
         q = np.asarray(q, dtype=float)
-        measure, poses = measure_from(self.links, obstacle), Poses.of(self.robot, q)
+        measure, poses = FromObstacle(self.links, obstacle), Poses.of(self.robot, q)
         rows, items = (index.ravel() for index in np.indices((len(q), len(self.links))))
         lower = measure.lower(poses, rows, items).reshape(len(q), -1)
         distances, nearest = np.full(len(q), np.inf), np.zeros(len(q), dtype=np.intp)
@@ -264,13 +239,12 @@ class CollisionModel:
     def nearest_to_obstacle(self, q: ArrayLike, obstacle: Union | Obstacle) -> Nearest:
         """Find the smallest signed distance of the arm from the obstacle on a path q (T, 6), rad.
 
-        It is accurate to `TOLERANCE` for a ball, for other shapes to `SHAPE_TOLERANCE`, inside to
-        `link_distances.RESOLUTION`.
+        It is accurate to `link_distances.TOLERANCE` for a ball, for other shapes to `SHAPE_TOLERANCE`, inside to
+        `RESOLUTION`.
         """
         nearest = NOTHING
         for part in obstacle.parts if isinstance(obstacle, Union) else (obstacle,):
-            tolerance = TOLERANCE if isinstance(part, Sphere) else SHAPE_TOLERANCE
-            found = self._search(measure_from(self.links, part), q, tolerance)
+            found = self._search(FromObstacle(self.links, part), q)
             assert found is not None  # always, without a ceiling
             nearest = min(nearest, found, key=lambda near: near.distance)
         return nearest
@@ -278,16 +252,16 @@ class CollisionModel:
     def nearest_to_itself(self, q: ArrayLike) -> Nearest | None:
         """Find the smallest distance of two links on a path q (T, 6), rad; None beyond `SELF_REACH`.
 
-        It is accurate to `SELF_TOLERANCE`. Links that a joint connects are left out.
+        It is accurate to `link_distances.SELF_TOLERANCE`. Links that a joint connects are left out.
         """
-        return self._search(BetweenLinks(self.links), q, SELF_TOLERANCE, SELF_REACH)
+        return self._search(BetweenLinks(self.links), q, SELF_REACH)
 
     def nearest_to_table(self, q: ArrayLike) -> Nearest:
-        """Find the smallest height above the table z = 0 on a path q (T, 6), rad, accurate to `TOLERANCE`.
+        """Find the smallest height above the table z = 0 on a path q (T, 6), rad, to `link_distances.TOLERANCE`.
 
         The base and link 1, which stand on it, are left out.
         """
-        found = self._search(AboveTable(self.links), q, TOLERANCE)
+        found = self._search(AboveTable(self.links), q)
         assert found is not None
         return found
 
@@ -297,9 +271,9 @@ class CollisionModel:
             self.nearest_to_obstacle(q, obstacle), self.nearest_to_itself(q), self.nearest_to_table(q)
         )
 
-    def _search(self, measure: Measure, q: ArrayLike, tolerance: float, ceiling: float = np.inf) -> Nearest | None:
+    def _search(self, measure: Measure, q: ArrayLike, ceiling: float = np.inf) -> Nearest | None:
         q = np.asarray(q, dtype=float)
-        return _Search(self.robot, measure, q, self._travel(measure, q), ceiling).run(tolerance)
+        return _Search(self.robot, measure, q, self._travel(measure, q), ceiling).run()
 
     def _travel(self, measure: Measure, q: Array) -> Array:
         """Bound the distances (T − 1, I) that the items' points move from sample to sample of q (T, 6)."""

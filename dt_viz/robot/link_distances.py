@@ -9,10 +9,11 @@ Lengths are metres, angles radians, positions in the robot's base frame.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from functools import cached_property, lru_cache
 from itertools import combinations
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 import coal
 import numpy as np
@@ -25,6 +26,10 @@ if TYPE_CHECKING:
     from dt_viz.flows.fields import Array, Indices
 
 
+TOLERANCE = 1e-4
+"""Largest excess of a reported smallest distance from a ball or the table, metres."""
+SELF_TOLERANCE = 1e-3
+"""Largest excess of a reported distance of links from each other, metres."""
 SHAPE_TOLERANCE = 1e-3
 """Largest excess of a reported smallest distance from an obstacle that is no ball, metres."""
 SURFACE_SPACING = 2e-3
@@ -139,139 +144,114 @@ class Link:
         return bool(abs(winding) > 0.5)
 
 
-class Measure(Protocol):
-    """Distances of several items, each a link or a pair of links."""
-
-    lowest: float
-    """Lower bound of all distances, metres."""
-
-    @property
-    def bodies(self) -> Indices:
-        """Indices (I,) of the items' moving links."""
-        ...
-
-    @property
-    def bases(self) -> Indices:
-        """Indices (I,) of the frames that the items are measured from and their motion is relative to."""
-        ...
-
-    def names(self, item: int) -> tuple[str, ...]:
-        """Return the names of an item's links."""
-        ...
-
-    def lower(self, poses: Poses, rows: Indices, items: Indices) -> Array:
-        """Compute quick lower bounds (N,) of the distances of items (N,) at the poses in rows (N,)."""
-        ...
-
-    def distance(self, poses: Poses, row: int, item: int, ceiling: float) -> float:
-        """Compute the distance of an item, exact below the ceiling; else any value between the ceiling and it."""
-        ...
-
-
-class _OfLinks:
-    """Base of the measures whose items are links, measured from something that does not move.
+class Measure(ABC):
+    """Distances of several items, each a link or a pair of links.
 
     Attributes:
-        bodies: see `Measure`.
-        bases: see `Measure`.
+        tolerance: largest excess of a reported smallest distance, metres.
+        lowest: distance below which no nearer place is searched for, metres.
+        bodies: indices (I,) of the items' moving links.
+        bases: indices (I,) of the frames that the items are measured from and their motion is relative to.
     """
 
-    def __init__(self, links: Sequence[Link], bodies: Sequence[int]) -> None:
-        self._links = [links[k] for k in bodies]
+    tolerance: float
+    lowest: float
+    bodies: Indices
+    bases: Indices
+
+    @abstractmethod
+    def names(self, item: int) -> tuple[str, ...]:
+        """Return the names of an item's links."""
+
+    @abstractmethod
+    def lower(self, poses: Poses, rows: Indices, items: Indices) -> Array:
+        """Compute quick lower bounds (N,) of the distances of items (N,) at the poses in rows (N,)."""
+
+    @abstractmethod
+    def distance(self, poses: Poses, row: int, item: int, ceiling: float) -> float:
+        """Compute the distance of an item, exact below the ceiling; else any value between the ceiling and it."""
+
+
+class _OfLinks(Measure):
+    """Base of the measures whose items are links, measured from something that does not move."""
+
+    def __init__(self, links: Sequence[Link], first_frame: int = 0) -> None:
+        self.bodies = np.array([k for k, link in enumerate(links) if link.frame >= first_frame])
+        self.bases = np.zeros_like(self.bodies)
+        self._links = [links[k] for k in self.bodies]
         self._frames = np.array([link.frame for link in self._links])
-        self._centres = np.array([link.centre for link in self._links])
-        self._half_sizes = np.array([link.half_size for link in self._links])
-        self.bodies, self.bases = np.array(bodies), np.zeros(len(bodies), dtype=np.intp)
+        # their balls, padded to the same number
+        most = max(len(link.balls.radii) for link in self._links)
+        fill = [np.minimum(np.arange(most), len(link.balls.radii) - 1) for link in self._links]
+        self._centres = np.stack([link.balls.centres[k] for link, k in zip(self._links, fill, strict=True)])
+        self._radii = np.stack([link.balls.radii[k] for link, k in zip(self._links, fill, strict=True)])
 
     def names(self, item: int) -> tuple[str, ...]:
         return (self._links[item].name,)
 
-
-class _FromBall(_OfLinks):
-    """Signed distances of the links from a ball, measured from its centre.
-
-    Coal's signed distance of a mesh from a ball is not its depth: once one triangle is inside, all other overlaps are
-    skipped. The distance from the centre is positive, and so exact.
-    """
-
-    def __init__(self, links: Sequence[Link], obstacle: Sphere) -> None:
-        super().__init__(links, range(len(links)))
-        self._point, self._position, self._radius = coal.Sphere(0.0), np.asarray(obstacle.position), obstacle.radius
-        self.lowest = -obstacle.radius
-        self._known: dict[int, list[tuple[Array, float, bool]]] = {}
-
     def lower(self, poses: Poses, rows: Indices, items: Indices) -> Array:
         frames = self._frames[items]
-        offset = self._position - poses.origins[rows, frames]
-        local = np.einsum("nji,nj->ni", poses.rotations[rows, frames], offset) - self._centres[items]
-        outside = np.maximum(np.abs(local) - self._half_sizes[items], 0.0)
-        return np.linalg.norm(outside, axis=1) - self._radius
+        turned = self._centres[items] @ poses.rotations[rows, frames].transpose(0, 2, 1)
+        centres = turned + poses.origins[rows, frames][:, None]
+        return (self._signed_distance(centres) - self._radii[items]).min(axis=1)
 
-    def distance(self, poses: Poses, row: int, item: int, ceiling: float) -> float:
-        link = self._links[item]
-        turn = poses.rotations[row, link.frame].T
-        centre = turn @ (self._position - poses.origins[row, link.frame])
-        place = coal.Transform3s(turn, centre)
-        gap = _coal_distance(link.surface, coal.Transform3s(), self._point, place, ceiling + self._radius)
-        return (0.0 if gap > 0 and self._inside(item, centre, gap) else gap) - self._radius
-
-    def _inside(self, item: int, point: Array, gap: float) -> bool:
-        """Return whether a point is inside the link, whose surface is at least `gap` away."""
-        known = self._known.setdefault(item, [])
-        for other, free, inside in known:
-            if np.linalg.norm(point - other) < free:  # no surface in between
-                return inside
-        inside = self._links[item].contains(point)  # slow, so remembered
-        known.append((point, gap, inside))
-        return inside
+    @abstractmethod
+    def _signed_distance(self, s: Array) -> Array:
+        """Compute the signed distances (*B,) of points (*B, 3) from what is measured from."""
 
 
-class _FromShape(_OfLinks):
-    """Signed distances of the links from an obstacle of any shape.
+class FromObstacle(_OfLinks):
+    """Signed distances of the links from an obstacle, which is a core and all that is within some radius of it.
 
-    Outside, it is coal's exact distance between the surfaces of obstacle and link; the surface of a mesh or a cloud is
-    the drawn one. Where they intersect, it is the obstacle's smallest signed distance at points that fill the link; the
-    depth may be larger by up to `RESOLUTION`.
+    The core of a ball is its centre, that of other shapes the shape itself, with radius 0. Outside, it is coal's exact
+    distance between the surfaces of core and link; the surface of a mesh or a cloud is the drawn one. Where they
+    intersect, the depth in the core is that of points that fill the link; the true one may be larger by `RESOLUTION`.
+
+    (Coal's signed distance of a mesh from a ball is not its depth: once one triangle is inside, all other overlaps are
+    skipped.)
     """
 
     def __init__(self, links: Sequence[Link], obstacle: Obstacle) -> None:
-        super().__init__(links, range(len(links)))
-        self._obstacle, self._core = obstacle, _coal_shape(obstacle)
-        self._turn, self._position = rotation(obstacle.wxyz), np.asarray(obstacle.position)
-        self._on_surface = self._turn @ obstacle.surface()[0][0] + self._position
-        # the balls of all links, padded to the same number
-        most = max(len(link.balls.radii) for link in links)
-        fill = [np.minimum(np.arange(most), len(link.balls.radii) - 1) for link in links]
-        self._ball_centres = np.stack([link.balls.centres[k] for link, k in zip(links, fill, strict=True)])
-        self._ball_radii = np.stack([link.balls.radii[k] for link, k in zip(links, fill, strict=True)])
-        self.lowest = SHAPE_TOLERANCE - obstacle.depth
+        super().__init__(links)
+        self._obstacle, self._turn, self._position = obstacle, rotation(obstacle.wxyz), np.asarray(obstacle.position)
+        if isinstance(obstacle, Sphere):
+            self._core, self._radius, self.tolerance = coal.Sphere(0.0), obstacle.radius, TOLERANCE
+            self._on_core = self._position
+        else:
+            self._core, self._radius, self.tolerance = _coal_shape(obstacle), 0.0, SHAPE_TOLERANCE
+            self._on_core = self._turn @ obstacle.surface()[0][0] + self._position
+        self.lowest = self.tolerance - obstacle.depth
 
-    def lower(self, poses: Poses, rows: Indices, items: Indices) -> Array:
-        frames = self._frames[items]
-        turned = np.einsum("nij,nkj->nki", poses.rotations[rows, frames], self._ball_centres[items])
-        centres = turned + poses.origins[rows, frames][:, None]
-        return (self._obstacle.signed_distance(centres) - self._ball_radii[items]).min(axis=1)
+    def _signed_distance(self, s: Array) -> Array:
+        return self._obstacle.signed_distance(s)
 
     def distance(self, poses: Poses, row: int, item: int, ceiling: float) -> float:
         link = self._links[item]
         turn, origin = poses.rotations[row, link.frame], poses.origins[row, link.frame]
-        deepest = self._deepest(link, turn, origin)
+        deepest = self._from_core(link, turn, origin)
         if deepest < -CERTAIN:
             return deepest
         place = coal.Transform3s(turn.T @ self._turn, turn.T @ (self._position - origin))
-        gap = _coal_distance(link.surface, coal.Transform3s(), self._core, place, max(ceiling, CERTAIN))
-        if gap > 0 and not (deepest < 0 and link.contains(turn.T @ (self._on_surface - origin))):
-            return gap
-        return min(deepest, 0.0)
+        at_most = max(ceiling + self._radius, CERTAIN)
+        gap = _coal_distance(link.surface, coal.Transform3s(), self._core, place, at_most)
+        if gap > 0 and not (deepest < RESOLUTION and link.contains(turn.T @ (self._on_core - origin))):
+            return gap - self._radius
+        return min(deepest, 0.0) - self._radius
 
-    def _deepest(self, link: Link, turn: Array, origin: Array) -> float:
-        """Return the smallest signed distance of the link's points, at most 0."""
+    def _from_core(self, link: Link, turn: Array, origin: Array) -> float:
+        """Return the smallest signed distance of the link's points from the core, or `RESOLUTION` where it is more."""
+
+        def from_core(points: Array) -> Array:
+            return self._signed_distance(points @ turn.T + origin) + self._radius
+
+        if (from_core(link.balls.centres) - link.balls.radii).min() >= RESOLUTION:
+            return RESOLUTION
         groups = link.groups
-        distance = self._obstacle.signed_distance(groups.centres @ turn.T + origin)
+        distance = from_core(groups.centres)
         # others have no point that is as deep as all of some group
-        (near,) = np.nonzero(distance - groups.radii < min(0.0, float((distance + groups.radii).min())))
-        points = np.concatenate([groups.points[:1], *(groups.of_group(int(group)) for group in near)])
-        return min(0.0, float(self._obstacle.signed_distance(points @ turn.T + origin).min()))
+        (near,) = np.nonzero(distance - groups.radii < min(RESOLUTION, float((distance + groups.radii).min())))
+        points = np.concatenate([groups.points[:0], *(groups.of_group(int(group)) for group in near)])
+        return float(from_core(points).min(initial=RESOLUTION))
 
 
 def _coal_shape(obstacle: Obstacle) -> coal.CollisionGeometry:
@@ -298,14 +278,10 @@ def _bounding_volumes(vertices: Array, faces: Indices) -> coal.CollisionGeometry
     return model
 
 
-def measure_from(links: Sequence[Link], obstacle: Obstacle) -> Measure:
-    """Return the measure of the links' signed distances from an obstacle."""
-    return _FromBall(links, obstacle) if isinstance(obstacle, Sphere) else _FromShape(links, obstacle)
-
-
-class BetweenLinks:
+class BetweenLinks(Measure):
     """Distances of those pairs of links that can come near each other."""
 
+    tolerance = SELF_TOLERANCE
     lowest = 0.0
 
     def __init__(self, links: Sequence[Link]) -> None:
@@ -320,12 +296,10 @@ class BetweenLinks:
         self.bases = self._frames[self._pairs[:, 0]]
 
     def names(self, item: int) -> tuple[str, ...]:
-        """See `Measure`."""
         first, second = self._pairs[item]
         return self._links[first].name, self._links[second].name
 
     def lower(self, poses: Poses, rows: Indices, items: Indices) -> Array:
-        """See `Measure`."""
         a, b = self._pairs[items].T
         apart = np.linalg.norm(self._centre(poses, rows, a) - self._centre(poses, rows, b), axis=1)
         return apart - self._radii[a] - self._radii[b]
@@ -336,7 +310,6 @@ class BetweenLinks:
         return turned + poses.origins[rows, frames]
 
     def distance(self, poses: Poses, row: int, item: int, ceiling: float) -> float:
-        """See `Measure`."""
         first, second = (self._links[k] for k in self._pairs[item])
         place, other_place = (
             coal.Transform3s(poses.rotations[row, link.frame], poses.origins[row, link.frame])
@@ -348,19 +321,16 @@ class BetweenLinks:
 class AboveTable(_OfLinks):
     """Heights of the links' lowest points above the table, on which the base and link 1 stand."""
 
+    tolerance = TOLERANCE
     lowest = -np.inf
 
     def __init__(self, links: Sequence[Link]) -> None:
-        super().__init__(links, [k for k, link in enumerate(links) if link.frame > 1])
+        super().__init__(links, first_frame=2)
 
-    def lower(self, poses: Poses, rows: Indices, items: Indices) -> Array:
-        """See `Measure`."""
-        up = poses.rotations[rows, self._frames[items], 2]  # (N, 3)
-        sag = (up * self._centres[items] - np.abs(up) * self._half_sizes[items]).sum(axis=1)
-        return poses.origins[rows, self._frames[items], 2] + sag
+    def _signed_distance(self, s: Array) -> Array:
+        return s[..., 2]
 
     def distance(self, poses: Poses, row: int, item: int, ceiling: float) -> float:
-        """See `Measure`."""
         link = self._links[item]
         heights = link.hull @ poses.rotations[row, link.frame, 2]
         return float(heights.min() + poses.origins[row, link.frame, 2])

@@ -18,15 +18,13 @@ from scipy.spatial.transform import Rotation
 from dt_viz.obstacles.shapes import Box, Cylinder, MeshObstacle, Sphere
 from dt_viz.robot.collision import (
     SELF_REACH,
-    SELF_TOLERANCE,
-    TOLERANCE,
     CollisionModel,
     CollisionReport,
     Nearest,
     load_collision_model,
 )
 from dt_viz.robot.inverse_kinematics import inverse_kinematics, track
-from dt_viz.robot.link_distances import RESOLUTION, SHAPE_TOLERANCE
+from dt_viz.robot.link_distances import RESOLUTION, SELF_TOLERANCE, SHAPE_TOLERANCE, TOLERANCE
 from dt_viz.robot.robot import LinkMesh, collision_meshes
 from dt_viz.warning import ARM, Kind, MotionWarning
 
