@@ -129,8 +129,6 @@ class AdaptiveFlow(Diffeomorphism):
     tolerance: float = 1e-8
     """Largest estimated error of a step of the points, in their unit. Tangents obey `TANGENT_TOLERANCE` instead: where
     space is squeezed strongly, det J may be off by some per cent."""
-    max_steps: int = 1000
-    """Largest number of steps of a point."""
 
     @property
     def dim(self) -> int:
@@ -141,7 +139,7 @@ class AdaptiveFlow(Diffeomorphism):
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         duration = -self.duration if inverse else self.duration
-        return carried(self.field, s, U, DORMAND_PRINCE, duration, self.max_steps, self.tolerance)
+        return carried(self.field, s, U, DORMAND_PRINCE, duration, MOST_STEPS, self.tolerance)
 
 
 @dataclass(frozen=True, init=False)

@@ -188,10 +188,6 @@ class GaussianGrid:
             columns = (columns[:, :, None] * factor[0][:, None, :]).reshape(len(s), -1)
         return columns
 
-    def gram(self) -> Array:
-        """Kernel matrix K (m, m) of the inducing points, whose form WᵀKW is the RKHS norm of a field."""
-        return self.features(self.inducing_points)
-
 
 @dataclass(frozen=True)
 class GridRBF(PointField):

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from scipy.optimize import OptimizeResult, minimize
@@ -66,10 +65,6 @@ class VelocityFit:
         minimize(function, kept.reshape(-1), jac=True, method="L-BFGS-B", callback=callback, options=options)
         return kept
 
-    @cached_property
-    def _gram(self) -> Array:
-        return self.grid.gram()
-
     def cost_and_gradient(self, weights: Array) -> tuple[float, Array]:
         """Compute the objective and its derivative by the weights W (m, d)."""
         num, d = self.positions.shape
@@ -99,7 +94,7 @@ class VelocityFit:
         for DV in derivatives:
             tangents.append(tangents[-1] + h * (DV @ tangents[-1][..., None])[..., 0])
 
-        smooth = self._gram @ weights
+        smooth = self._gram_times(weights)
         gradient = 2 * self.regularisation * smooth
         for s, w, DV in zip(reversed(path[:-1]), reversed(tangents[:-1]), reversed(derivatives), strict=True):
             gradient += h * self._pull_back(s, by_point, w, by_tangent)
@@ -109,6 +104,14 @@ class VelocityFit:
             by_tangent = by_tangent + h * (transposed @ by_tangent[..., None])[..., 0]
         cost = float((error**2).sum() / num + self.regularisation * (weights * smooth).sum())
         return cost, gradient
+
+    def _gram_times(self, weights: Array) -> Array:
+        """Compute K·W axis by axis: the kernel matrix of a grid is a Kronecker product."""
+        table = weights.reshape(*self.grid.shape, -1)
+        for j, axis in enumerate(self.grid.axes):
+            gram = np.exp(-self.grid.ell * (axis[:, None] - axis) ** 2)
+            table = np.moveaxis(np.tensordot(gram, table, axes=(1, j)), 0, j)
+        return table.reshape(weights.shape)
 
     def _pull_back(self, s: Array, by_value: Array, w: Array, by_slope: Array) -> Array:
         """Compute the derivative (m, d) by W of Σ_n by_value·V(s) + by_slope·DV(s)·w."""
