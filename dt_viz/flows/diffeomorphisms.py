@@ -8,7 +8,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, overload
+from typing import Literal, TypeVar
 
 import numpy as np
 
@@ -257,6 +257,9 @@ MAX_STEPS, MOST_STEPS = 50, 1000
 """Largest numbers of steps of a flow: on the page, and at all."""
 
 
+_Flow = TypeVar("_Flow", Flow, AdaptiveFlow)
+
+
 @dataclass(frozen=True)
 class Integration:
     """A method and, where it is not `auto`, its number of steps. Raises FormatError on another number of them."""
@@ -272,13 +275,7 @@ class Integration:
         """Whether the user chose the steps, so that no tolerance is guaranteed."""
         return self.method != "auto"
 
-    @overload
-    def of(self, flow: Flow) -> Flow: ...
-
-    @overload
-    def of(self, flow: AdaptiveFlow) -> Flow | AdaptiveFlow: ...
-
-    def of(self, flow: Flow | AdaptiveFlow) -> Flow | AdaptiveFlow:
+    def of(self, flow: _Flow) -> _Flow | Flow:
         """The flow integrated by this method; `auto` leaves `flow` as it is."""
         if self.method == "auto":
             return flow
