@@ -1,13 +1,14 @@
-"""The kind of transform that dt_viz/README.md adds: its class, made from the README's text, and its vector field."""
+"""The kind of transform that dt_viz/README.md adds: its class and its registry, made from the text, and its field."""
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar  # noqa: F401 - of the README's example
 
 import numpy as np
 
 import dt_viz
-from dt_viz.avoidance.transform import Built, MotionBelow, Number, Setting, Transform  # noqa: F401
+from dt_viz.avoidance.page import Number, PageEntry  # noqa: F401 - of the README's example
+from dt_viz.avoidance.registry import KINDS
+from dt_viz.avoidance.transform import Built, MotionBelow, Transform  # noqa: F401
 from dt_viz.flows.diffeomorphisms import Flow  # noqa: F401
 from dt_viz.flows.fields import Array
 
@@ -33,9 +34,9 @@ class Whirl:
 
 
 def shown_in_the_readme():
-    """The class that dt_viz/README.md shows, made from its text."""
+    """The class that dt_viz/README.md shows, and the registry with the line that it shows."""
     text = (Path(dt_viz.__file__).parent / "README.md").read_text(encoding="utf-8")
-    code = text.split("## Adding a new transform")[1].split("```python")[1].split("```")[0]
+    code, line = (part.split("```")[0] for part in text.split("## Adding a new transform")[1].split("```python")[1:3])
     names = dict(globals())
-    exec(compile("from __future__ import annotations\n" + code, "README.md", "exec"), names)
-    return names["Twirl"]
+    exec(compile(f"from __future__ import annotations\n{code}\nADDED = {{{line}}}", "README.md", "exec"), names)
+    return names["Twirl"], KINDS | names["ADDED"]

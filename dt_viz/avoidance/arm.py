@@ -8,26 +8,19 @@ a drag costs p(t) = ψ_q⁻¹(q(t)) only, one batched flow in R⁶.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from dt_viz.avoidance.arm_field import (
-    LEVERS,
-    REACH_PER_TEMPERATURE,
-    GradientField,
-    JointLimits,
-    WholeArmField,
-)
-from dt_viz.avoidance.arm_solver import MAX_DURATION, SLOPE, ArmSolution, Solver
+from dt_viz.avoidance.arm_field import LEVERS, JointLimits, WholeArmField
+from dt_viz.avoidance.arm_solver import MAX_DURATION, ROUNDING, SLOPE, ArmSolution, Solver
 from dt_viz.avoidance.avoidance import ArmAvoidance
-from dt_viz.avoidance.detour import Detour, escape_directions, remembered, travel
+from dt_viz.avoidance.detour import Detour, carried_over, escape_directions
 from dt_viz.avoidance.lift import Lift
 from dt_viz.avoidance.passing import ANEW, Passing
-from dt_viz.flows.fields import Array, Indices, Mask, VectorField
+from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.kernels.blocks import room_asked
 from dt_viz.kernels.dodging import Forecast, LimitedArm, dodge
 from dt_viz.kernels.proximity import contacts, least_contacts, proximity
@@ -46,7 +39,7 @@ NUM_COMPARED = 60
 """Colliding samples that escapes are compared by."""
 DURATION_CHANGE = 50.0
 """Largest change of the flow time for each metre that an obstacle is dragged: contacts move by 1 cm a millimetre."""
-NUM_WAYS = 3
+NUM_ESCAPES = 3
 """Largest number of escapes from each obstacle that are tried."""
 TOGETHER, OPPOSED = 0.05, -0.5
 """Clearance from another obstacle, metres, up to which a colliding posture meets both, and cosine of the angle between
@@ -96,7 +89,7 @@ class WholeArm:
 
     def undisturbed(self, lifted: Lift, avoidance: ArmAvoidance, spacing: float) -> ArmSolution:
         """The motions as lifted, avoiding nothing."""
-        return self._solver(lifted, avoidance, None, spacing, coarse=True).solution()
+        return self._solver(lifted, avoidance, (), spacing).solution()
 
     def avoiding(
         self,
@@ -125,71 +118,43 @@ class WholeArm:
             coarse: whether the flow is integrated for the eye only, in a few equal steps.
             passing: detours to keep while obstacles are dragged.
         """
-        parts = avoidance.avoided.parts
-        known = remembered(passing.arm, parts)
-        sides, pins = self._sides(lifted, avoidance, known), self._pins(lifted)
-        best = None
-        for attempt in range(min(NUM_WAYS, max(map(len, sides), default=0))):
-            detours = [
-                _on_side(part, found[min(attempt, len(found) - 1)], last) if found else None
-                for part, found, last in zip(parts, sides, known, strict=True)
-            ]
-            generator = self._generator(detours, avoidance, pins)
-            by_hand = avoidance.duration is not None or avoidance.generator == "probability"
-            solver = self._solver(lifted, avoidance, generator, spacing, coarse=coarse or not by_hand)
-            tried = replace(solver.solution(), detours=tuple(detours))
+        known = carried_over(passing.arm, avoidance.avoided.parts, turn=False)
+        sides = self._sides(lifted, avoidance, known)
+        by_hand = avoidance.duration is not None or avoidance.generator == "probability"
+        coarsely, best = coarse or not by_hand, None
+        for attempt in range(min(NUM_ESCAPES, max(map(len, sides), default=0))):
+            detours = _detours(avoidance, sides, known, [attempt] * len(sides))
+            tried = self._solver(lifted, avoidance, detours, spacing, coarse=coarsely).solution()
             if by_hand:
                 return tried
             if best is None or self._better(tried, best):
                 best = tried
             if tried.soon or (tried.cleared and any(detour is not None and detour.kept for detour in detours)):
                 break
-        if best is None:
-            return self.undisturbed(lifted, avoidance, spacing)
-        if coarse:
+        if coarse and best is not None:
             return best
-        generator = self._generator(best.detours, avoidance, pins)
-        exact = self._solver(lifted, avoidance, generator, spacing, coarse=False).solution()
-        return replace(exact, detours=best.detours)
+        return self._solver(lifted, avoidance, best.detours if best else (), spacing, coarse=False).solution()
 
     def followed(self, lifted: Lift, avoidance: ArmAvoidance, spacing: float, passing: Passing) -> ArmSolution:
         """Coarse motions that follow an obstacle which is dragged: they change no faster than the obstacle moves.
 
-        Detours turn towards the sides that are to be taken, and the flow's duration changes, by so much for each metre
-        of the drag. So no motion jumps, where a side is changed or none clears it: until the new way is there, motions
-        may come nearer to the obstacle than the margin. Where a way is there and does not clear it, the next side is
-        turned to. For the other arguments see `avoiding`.
+        Detours turn towards the sides that are to be taken, and the flow's duration changes, at rates limited by the
+        drag. So no motion jumps where the side changes or none clears the obstacle; until a detour has arrived at its
+        side, motions may come nearer than the margin. Where it has and does not clear, it turns to the next side.
 
         Args:
             lifted: the motions below.
             avoidance: what is to be avoided.
             spacing: as in `avoiding`.
-            passing: the detours of the motions where the obstacles were just before, and the duration of their flow.
+            passing: the detours around the obstacles at their last poses, and the duration of that flow.
         """
-        parts = avoidance.avoided.parts
-        known = remembered(passing.arm, parts)
+        known = carried_over(passing.arm, avoidance.avoided.parts)
         failed = not passing.cleared and passing.duration >= MAX_DURATION
-        detours: list[Detour | None] = []
-        for part, found, last in zip(parts, self._sides(lifted, avoidance, known), known, strict=True):
-            if not found:
-                detours.append(None)
-            elif last is None:
-                detours.append(_on_side(part, found[0], last))
-            else:
-                side = found[1] if failed and last.is_there and len(found) > 1 else found[0]
-                detours.append(_on_side(part, side, last).turned_from(last, found, avoidance.detour.turning))
-        if not any(detours):
-            return self.undisturbed(lifted, avoidance, spacing)
-        moved = max(travel(last.obstacle, part) for last, part in zip(known, parts, strict=True) if last is not None)
-        change = DURATION_CHANGE * moved
+        attempts = [int(failed and last is not None and last.arrived) for last in known]
+        detours = _detours(avoidance, self._sides(lifted, avoidance, known), known, attempts)
+        change = DURATION_CHANGE * max((last.travelled or 0.0 for last in known if last is not None), default=0.0)
         between = max(passing.duration - change, 0.0), min(passing.duration + change, MAX_DURATION)
-        generator = self._generator(detours, avoidance, self._pins(lifted))
-        solver = self._solver(lifted, avoidance, generator, spacing, coarse=True, between=between)
-        return replace(solver.solution(), detours=tuple(detours))
-
-    def _pins(self, lifted: Lift) -> Array:
-        """The postures (K, 6) that do not move, where the flow meets them."""
-        return self.limits.forward(self.limits.inside(lifted.pins))
+        return self._solver(lifted, avoidance, detours, spacing, between=between).solution()
 
     def _better(self, tried: ArmSolution, best: ArmSolution) -> bool:
         """Whether one solution's motions clear the obstacle with less detour than another's, or come nearer to it."""
@@ -214,22 +179,14 @@ class WholeArm:
             fraction: s, from 0 to 1.
             spacing: as in `avoiding`.
         """
-        solver = self._solver(lifted, avoidance, None, spacing, coarse=True)
-        return replace(solver.through(full.transform.scaled(fraction), full.duration), detours=full.detours)
+        solver = self._solver(lifted, avoidance, full.detours, spacing, coarse=False)
+        return solver.through(full.transform.scaled(fraction), full.duration)
 
-    def clearance(self, q: Array, obstacle: Union | Obstacle, enough: ArrayLike = np.inf) -> Array:
+    def clearance(
+        self, q: Array, obstacle: Union | Obstacle, highest: ArrayLike = np.inf, lowest: ArrayLike = -np.inf
+    ) -> Array:
         """Distance (N,), metres, of arm and end effector from the obstacle; see `BodyPoints.clearance`."""
-        return self.body.clearance(self.robot, q, obstacle, enough)
-
-    def _generator(self, detours: Sequence[Detour | None], avoidance: ArmAvoidance, pins: Array) -> VectorField:
-        """The field whose flow takes these detours, with these postures (K, 6) at rest, where the flow meets them."""
-        reach = REACH_PER_TEMPERATURE * avoidance.temperature
-        met = [detour for detour in detours if detour is not None]
-        obstacles = tuple(detour.obstacle for detour in met)
-        if avoidance.generator == "probability":
-            return GradientField(self.robot, self.body, obstacles, reach)
-        directions = np.stack([detour.direction for detour in met])
-        return WholeArmField(self.robot, self.body, obstacles, directions, pins, reach)
+        return self.body.clearance(self.robot, q, obstacle, highest, lowest)
 
     def _sides(self, lifted: Lift, avoidance: ArmAvoidance, known: Sequence[Detour | None]) -> list[list[Array]]:
         """Escapes (3,) from each obstacle, the most promising first; none where nothing comes too near it.
@@ -241,7 +198,8 @@ class WholeArm:
         tangents = np.gradient(self.robot.end_effector(q), axis=1).reshape(-1, 3)
         tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
         q = q.reshape(-1, NUM_JOINTS)
-        near: Mask = np.array([self.clearance(q, part, margin) < margin for part in parts]).reshape(len(parts), len(q))
+        near: Mask = np.array([self.clearance(q, part, margin, margin - ROUNDING) < margin for part in parts])
+        near = near.reshape(len(parts), len(q))
         clearance = np.array([self.body.outermost.clearance(self.robot, q, part, BESIDE) for part in parts])  # about
         clearance = clearance.reshape(len(parts), len(q))
 
@@ -256,7 +214,7 @@ class WholeArm:
                 tangents[bent[:: max(1, len(bent) // NUM_COMPARED)]],
                 Union(tuple(parts[k] for k in which)),
                 margin,
-                num=NUM_WAYS,
+                num=NUM_ESCAPES,
                 settings=avoidance.detour,
                 previous=next((last.side for last in (known[k] for k in which) if last is not None), None),
             )
@@ -277,6 +235,25 @@ class WholeArm:
         return sides
 
 
-def _on_side(obstacle: Obstacle, side: Array, previous: Detour | None) -> Detour:
-    """The detour around an obstacle on a side, which goes on from the previous one, if any."""
-    return Detour(obstacle, side, side, kept=previous is not None)
+def _detours(
+    avoidance: ArmAvoidance,
+    sides: Sequence[Sequence[Array]],
+    known: Sequence[Detour | None],
+    attempts: Sequence[int],
+) -> tuple[Detour | None, ...]:
+    """The detours on these of the sides, or on their way there from those that are carried over.
+
+    Args:
+        avoidance: whose detours they are.
+        sides: (3,) escapes from each obstacle, the most promising first.
+        known: detours that are carried over.
+        attempts: which of the sides of each obstacle is taken; the last one where there are fewer.
+    """
+    detours: list[Detour | None] = []
+    for part, found, last, attempt in zip(avoidance.avoided.parts, sides, known, attempts, strict=True):
+        side = found[min(attempt, len(found) - 1)] if found else None
+        detour = None if side is None else Detour(part, side, side, kept=last is not None)
+        if detour is not None and last is not None and last.travelled is not None:
+            detour = detour.turned_from(last, found, avoidance.detour.turning)
+        detours.append(detour)
+    return tuple(detours)

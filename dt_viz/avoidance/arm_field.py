@@ -1,12 +1,12 @@
 """Whole-arm avoidance: diffeomorphisms of configuration space (sec. 4.5).
 
 A configuration is six joint angles, rad. `WholeArmField` is a generator V_q on R⁶ whose reverse flow carries the arm
-out of an obstacle; `JointLimits` bends R⁶ so that no flow leaves the joint limits. Derivatives are exact to rounding by
-complex steps: f(q + ih·u) = f(q) + ih·Df(q)·u + O(h²), with no difference of near numbers, so h can be tiny.
+out of an obstacle; `JointLimits` bends R⁶ so that no flow leaves the joint limits.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -23,7 +23,6 @@ from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.robot.body_points import BodyPoints
 from dt_viz.robot.robot import NUM_JOINTS, Robot, cross
 
-COMPLEX_STEP = 1e-30
 DIFFERENCE = 1e-4
 """Step of the finite differences for the slope of an obstacle's distance, metres."""
 POSTURE_DIFFERENCE = 1e-5
@@ -57,7 +56,7 @@ NEAREST_TO_LIMIT = 0.9
 
 
 @dataclass(frozen=True, eq=False)
-class ArmField:
+class ArmField(ABC):
     """Base of the generators V_q on R⁶ of an arm and obstacles."""
 
     robot: Robot
@@ -70,13 +69,17 @@ class ArmField:
         """Dimension of configuration space."""
         return NUM_JOINTS
 
+    @abstractmethod
     def __call__(self, q: Array) -> Array:
         """Compute V_q at configurations `q` (N, 6), as (N, 6)."""
-        raise NotImplementedError
 
     def with_jacobian(self, q: Array) -> tuple[Array, Array]:
-        """Compute V_q (N, 6) and DV_q (N, 6, 6) at configurations `q` (N, 6)."""
-        raise NotImplementedError
+        """Compute V_q (N, 6) and DV_q (N, 6, 6), by differences of fourth order, at configurations `q` (N, 6)."""
+        steps = POSTURE_DIFFERENCE * np.array([1, -1, 2, -2])[:, None, None] * np.eye(NUM_JOINTS)
+        shifted = (q[:, None, None] + steps).reshape(-1, NUM_JOINTS)
+        near, before, far, behind = np.moveaxis(self(shifted).reshape(len(q), 4, NUM_JOINTS, NUM_JOINTS), 1, 0)
+        slopes = (8 * (near - before) - (far - behind)) / (12 * POSTURE_DIFFERENCE)
+        return self(q), slopes.transpose(0, 2, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,14 +136,6 @@ class WholeArmField(ArmField, CompiledField):
         """Compute V_q at configurations `q` (N, 6), as (N, 6)."""
         return self._carried(q, RATE)
 
-    def with_jacobian(self, q: Array) -> tuple[Array, Array]:
-        """Compute V_q (N, 6) and DV_q (N, 6, 6), by differences of fourth order, at configurations `q` (N, 6)."""
-        steps = POSTURE_DIFFERENCE * np.array([1, -1, 2, -2])[:, None, None] * np.eye(NUM_JOINTS)
-        shifted = (q[:, None, None] + steps).reshape(-1, NUM_JOINTS)
-        near, before, far, behind = np.moveaxis(self(shifted).reshape(len(q), 4, NUM_JOINTS, NUM_JOINTS), 1, 0)
-        slopes = (8 * (near - before) - (far - behind)) / (12 * POSTURE_DIFFERENCE)
-        return self(q), slopes.transpose(0, 2, 1)
-
     def rk4(self, s: Array, duration: float, steps: int) -> Array:
         return self._carried(s, RK4, duration, steps)
 
@@ -173,18 +168,11 @@ class GradientField(ArmField):
         moment = self._beyond(cross(points, force)) - cross(chain.origins, self._beyond(force))
         return (chain.axes[:, 2] * moment).sum(axis=1).T
 
-    def with_jacobian(self, q: Array) -> tuple[Array, Array]:
-        """Compute V_q (N, 6) and DV_q (N, 6, 6) at configurations `q` (N, 6)."""
-        num, d = q.shape
-        shifted: Any = (q + 1j * COMPLEX_STEP * np.eye(d)[:, None]).reshape(-1, d)  # fields take complex angles, too
-        values = self(shifted).reshape(d, num, d)
-        return values[0].real, values.imag.transpose(1, 2, 0) / COMPLEX_STEP
-
     def _force(self, obstacle: Obstacle, points: Array) -> Array:
         """Compute the forces (P, 3, N) of one obstacle on body points (P, 3, N): −30u²(1 − u)² times their way out."""
         distance = obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]
         core = -CORE * (obstacle.depth + self.body.radius)[:, None]
-        u = _unit_interval((self.reach - distance) / (self.reach - core))
+        u = np.clip((self.reach - distance) / (self.reach - core), 0, 1)
         return -30 * (u * u * (1 - u) * (1 - u))[:, None] * _outward(obstacle, points)
 
     def _beyond(self, values: Array) -> Array:
@@ -224,14 +212,8 @@ class JointLimits(Diffeomorphism):
 
     def inside(self, q: Array) -> Array:
         """Clip configurations (*B, 6) to a little less than the limits, where ψ is finite."""
-        lowest, highest = self._innermost
-        return np.minimum(np.maximum(q, lowest), highest)
-
-    @cached_property
-    def _innermost(self) -> tuple[Array, Array]:
-        """Bounds (6,) of what is inside."""
         slack = (1 - NEAREST_TO_LIMIT) * self.zone
-        return self.lower + slack, self.upper - slack
+        return np.minimum(np.maximum(q, self.lower + slack), self.upper - slack)
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         part = self.fraction if inverse else -self.fraction
@@ -239,13 +221,8 @@ class JointLimits(Diffeomorphism):
         return mapped, None if U is None else (factor**3)[..., None] * U
 
 
-def _unit_interval(u: Array) -> Array:
-    """Clip u, which may be complex, to the interval from 0 to 1."""
-    return np.where(u.real <= 0, 0.0, np.where(u.real >= 1, 1.0, u))
-
-
 def _outward(obstacle: Obstacle, points: Array) -> Array:
-    """Compute the slope (P, 3, N) of an obstacle's distance at `points` (P, 3, N) by differences, analytic."""
+    """Compute the slope (P, 3, N) of an obstacle's distance at `points` (P, 3, N) by differences."""
     shifts = DIFFERENCE * np.eye(3)[:, None, None]
     s = points.transpose(0, 2, 1)
     near, far = (obstacle.signed_distance(s + k * shifts) - obstacle.signed_distance(s - k * shifts) for k in (1, 2))

@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dt_viz.avoidance.arm_field import LEVERS, SPEED, JointLimits
+from dt_viz.avoidance.arm_field import (
+    LEVERS,
+    REACH_PER_TEMPERATURE,
+    SPEED,
+    GradientField,
+    JointLimits,
+    WholeArmField,
+)
 from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.avoidance.clearing import clearing_duration
 from dt_viz.avoidance.detour import Detour
@@ -21,18 +28,18 @@ from dt_viz.robot.body_points import BodyPoints
 from dt_viz.robot.robot import NUM_JOINTS, Robot
 
 NUM_COARSE = 40
-"""The same for coarse motions."""
+"""Number of samples of each rollout of coarse motions, before refinement."""
 MAX_DURATION = 2.0
 """Longest flow that is tried: a contact at full strength moves by 40 cm in it."""
 SNAPSHOT = 0.1
-"""Flow time between two looks at the clearance: contacts move by at most two centimetres in it."""
+"""Flow time between two checks of the clearance: contacts move by at most two centimetres in it."""
 STRIDE = 3
-"""Every which sample the duration is chosen for at first: the time that they take to leave changes slowly along a
-rollout, and the deepest are not the last."""
+"""Stride of the samples that the duration is chosen for at first: the time that they take to escape changes slowly
+along a rollout."""
 MAX_ROUNDS = 4
-"""Rounds of refinement and of a longer flow where the samples that it adds are not clear."""
+"""Largest number of rounds in which the flow is prolonged for samples that refinement has added."""
 SLOPE = 0.1
-"""Clearance that is asked for, beside a start or goal that has less itself, for each metre of distance from it."""
+"""Slope, m/m, at which the required clearance grows away from a start or goal that has less than the margin."""
 MOVED = 5e-3
 """Smallest shift of an added start by the avoidance that is reported, metres."""
 ROUNDING = 1e-3
@@ -40,7 +47,7 @@ ROUNDING = 1e-3
 COARSE_STEP = 0.25
 """Length of a coarse RK4 step, in flow time: off by at most 1.2 mm at the hand in drags around Draw S and push box."""
 COARSE_SPACING = 0.025
-"""Distance, metres at the hand, about, up to which neighbouring samples of coarse motions may be apart."""
+"""Largest distance between neighbouring samples of coarse motions, metres at the hand, about."""
 TOLERANCE = 3e-9
 """Tolerance of a step of the fine flow, rad."""
 LONG = 1.0
@@ -67,11 +74,11 @@ class ArmSolution:
     """Smallest distance of the arm from the obstacle along the rollouts that shape the flow, metres; only where it is
     near, else less."""
     stuck: Indices
-    """Hosts that do not keep the clearance that is asked for."""
+    """Rollouts that shape the flow and do not keep the clearance that is asked for."""
     too_near: Indices
-    """Guests, counted among all rollouts, that do not keep it."""
+    """Rollouts from added starts that do not keep it, counted among all rollouts."""
     moved: Indices
-    """Guests that begin more than `MOVED` away from their start."""
+    """Those that begin more than `MOVED` away from their start."""
     detours: tuple[Detour | None, ...] = ()
     """Detour around each obstacle; None for those that are not in the way, empty where none is."""
 
@@ -82,7 +89,7 @@ class ArmSolution:
 
     @property
     def soon(self) -> bool:
-        """Whether they keep it after so short a flow that nothing better is looked for."""
+        """Whether they keep it after so short a flow that no other escape is tried."""
         return self.cleared and self.duration <= LONG
 
 
@@ -96,21 +103,34 @@ class Solver:
         limits: JointLimits,
         lifted: Lift,
         avoidance: ArmAvoidance,
-        generator: VectorField | None,
+        detours: Sequence[Detour | None],
         spacing: float,
         *,
-        coarse: bool,
+        coarse: bool = True,
         between: tuple[float, float] = (0.0, MAX_DURATION),
     ) -> None:
         self._robot, self._body, self._limits = robot, body, limits
         self._lifted = lifted
         self._avoidance = avoidance
-        self._generator = generator
+        self._detours = tuple(detours)
+        self._generator = self._generated([detour for detour in detours if detour is not None])
         self._spacing = spacing
-        self._coarse = coarse and generator is not None
-        self._shortest, self._longest = between
+        self._coarse = coarse and self._generator is not None
+        self._between = between
         self._margin = max(float(avoidance.margin), 2 * ROUNDING)
         self._room = body.clearance(robot, lifted.pins, avoidance.avoided, self._margin + ROUNDING) - ROUNDING
+
+    def _generated(self, met: Sequence[Detour]) -> VectorField | None:
+        """The field whose flow takes these detours, with starts and goal at rest; None without any."""
+        reach = REACH_PER_TEMPERATURE * self._avoidance.temperature
+        obstacles = tuple(detour.obstacle for detour in met)
+        if not met:
+            return None
+        if self._avoidance.generator == "probability":
+            return GradientField(self._robot, self._body, obstacles, reach)
+        pins = self._limits.forward(self._limits.inside(self._lifted.pins))
+        directions = np.stack([detour.direction for detour in met])
+        return WholeArmField(self._robot, self._body, obstacles, directions, pins, reach)
 
     def solution(self) -> ArmSolution:
         """Find the motions: with `auto`, after the shortest duration that clears them."""
@@ -121,19 +141,19 @@ class Solver:
             shaping = self._lifted.tracked.q[: self._lifted.num_shaping]
             q = self._limits.inside(shaping[:, ::STRIDE].reshape(-1, NUM_JOINTS))
             duration = self._clearing_duration(q[self._lack(q) > 0])
-        return self._with_duration(min(max(duration, self._shortest), self._longest))
+        return self._with_duration(float(np.clip(duration, *self._between)))
 
     def _with_duration(self, duration: float) -> ArmSolution:
         transform = self._transform(duration)
         bundle = self._sampled(transform)
         asked, kept = self._clearances(bundle.positions / LEVERS)
-        automatic = self._generator is not None and self._avoidance.duration is None
+        automatic, longest = self._generator is not None and self._avoidance.duration is None, self._between[1]
         for _ in range(MAX_ROUNDS if automatic else 0):
             lacking = self._shaping(bundle) & (asked > kept)
-            if duration >= self._longest or (asked - kept)[lacking].max(initial=0.0) <= ROUNDING:
+            if duration >= longest or (asked - kept)[lacking].max(initial=0.0) <= ROUNDING:
                 break
             p = bundle.positions[lacking] / LEVERS
-            more = min(self._clearing_duration(p), self._longest - duration)
+            more = min(self._clearing_duration(p), longest - duration)
             duration += more
             bundle, transform = self._continued(bundle, more, duration)
             asked, kept = self._clearances(bundle.positions / LEVERS)
@@ -149,7 +169,7 @@ class Solver:
         return self._refined(replace(bundle, levels=levels), transform), transform
 
     def through(self, transform: Diffeomorphism, duration: float) -> ArmSolution:
-        """The motions of a transform that is there already, of which that is the full duration."""
+        """The motions of a given transform, of which that is the full duration."""
         bundle = self._sampled(transform)
         return self._along(bundle, transform, duration, *self._clearances(bundle.positions / LEVERS))
 
@@ -162,9 +182,9 @@ class Solver:
         stuck, too_near = (np.unique(bundle.index[near & which]) for which in (shaping, ~shaping))
         away = np.linalg.norm(self._robot.end_effector(p) - self._robot.end_effector(q), axis=1) > MOVED
         moved = np.unique(bundle.index[away & ~shaping & (bundle.fraction == 0)])
-        return ArmSolution(
-            transform, bundle.index, bundle.fraction, q, p, duration, float(kept[shaping].min()), stuck, too_near, moved
-        )
+        clearance, detours = float(kept[shaping].min()), self._detours if any(self._detours) else ()
+        ends = stuck, too_near, moved
+        return ArmSolution(transform, bundle.index, bundle.fraction, q, p, duration, clearance, *ends, detours)
 
     def _shaping(self, bundle: Bundle) -> Mask:
         return bundle.index < self._lifted.num_shaping
@@ -206,8 +226,8 @@ class Solver:
     def _clearances(self, p: Array) -> tuple[Array, Array]:
         """Clearances (N,), metres, that are asked for at configurations (N, 6), and that are kept.
 
-        Asked for is the margin, or what the starts and goal beside a configuration have. What is kept ends where it is
-        more by what a contact moves between two looks at it.
+        Asked for is the margin, or what the starts and goal beside a configuration have. What is kept is cut off where
+        it is more by what a contact moves between two checks.
         """
         asked = room_asked(np.array(p, order="C"), self._lifted.pins, self._room, LEVERS, SLOPE, self._margin)
         return asked, self._body.clearance(self._robot, p, self._avoidance.avoided, asked + SPEED * SNAPSHOT)
@@ -215,7 +235,7 @@ class Solver:
     def _clearing_duration(self, p: Array) -> float:
         """The shortest duration after which the flow has carried configurations (N, 6) clear, or the longest."""
         assert self._generator is not None
-        return clearing(self._generator, self._limits, p, self._lack, SNAPSHOT, self._longest)
+        return clearing(self._generator, self._limits, p, self._lack, SNAPSHOT, self._between[1])
 
 
 def clearing(
@@ -228,7 +248,7 @@ def clearing(
         limits: of the joints.
         p: (N, 6) rad.
         lack: distances (N,), metres, by which postures (N, 6) miss the clearance that is asked for.
-        step: flow time between two looks at the clearance.
+        step: flow time between two checks of the clearance.
         longest: flow time.
     """
     duration = clearing_duration(field, limits.forward(p), lambda state: lack(limits.inverse(state)), step, longest)

@@ -2,22 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, ClassVar, Literal, TypeVar, get_args
 
 from dt_viz.avoidance.detour import DETOUR, DetourSettings
-from dt_viz.avoidance.transform import (
-    MOST_DURATION,
-    Built,
-    Choice,
-    FlowIntegration,
-    MotionBelow,
-    Number,
-    Setting,
-    Transform,
-)
+from dt_viz.avoidance.transform import MOST_DURATION, Built, MotionBelow, Transform
 from dt_viz.errors import FormatError, check_between
 from dt_viz.flows.diffeomorphisms import AUTO, Identity, Integration
 from dt_viz.obstacles.occupancy import Generator
@@ -27,11 +18,6 @@ from dt_viz.obstacles.union import Union
 Space = Literal["task", "cspace"]
 """Space of the avoidance: that of the end effector, or configuration space."""
 SPACES: tuple[Space, ...] = get_args(Space)
-GENERATOR_NAMES: Mapping[Generator, str] = {
-    "free-space": "Free space (−∇log(1−p))",
-    "probability": "Probability (∇p, the paper's)",
-}
-"""Names of the generators."""
 _Kind = TypeVar("_Kind", bound="Avoidance")
 
 
@@ -60,37 +46,6 @@ class Avoidance(Transform):
     detour: DetourSettings
     """Choice of the side on which motions pass."""
 
-    title: ClassVar[str] = "Avoidance"
-    hint: ClassVar[str] = "leads motions around the obstacles"
-    most: ClassVar[int] = 1
-    stays_outermost: ClassVar[bool] = True
-    yields_goal: ClassVar[bool] = True
-    settings: ClassVar[tuple[Setting, ...]] = (
-        Choice("generator", "Generator", GENERATOR_NAMES, "the vector field whose flow avoids"),
-        Number(
-            "temperature",
-            "Temperature",
-            "T",
-            low=1.0,
-            high=20.0,
-            step=0.5,
-            initial=6.0,
-            hint="the higher, the more gently motions bend, and from farther away",
-        ),
-        Number(
-            "duration",
-            "Flow time",
-            "t",
-            low=0.0,
-            high=2.0,
-            step=0.01,
-            initial=0.5,
-            automatic=True,
-            of_flow=True,
-            hint="auto: the shortest flow that clears the obstacles by the margin",
-        ),
-        FlowIntegration(),
-    )
     kinds: ClassVar[dict[Space, type[Avoidance]]] = {}
     """The kinds, by the space in which they act."""
     space: ClassVar[Space]

@@ -9,24 +9,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 
 from dt_viz.avoidance.bias_fields import Shift, shifting_time, unit_field
 from dt_viz.avoidance.clearing import clearing_duration
-from dt_viz.avoidance.transform import (
-    MOST_DURATION,
-    Built,
-    FlowIntegration,
-    MotionBelow,
-    Number,
-    Setting,
-    Surroundings,
-    Switch,
-    Transform,
-    axes_of,
-)
+from dt_viz.avoidance.transform import MOST_DURATION, Anchored, Built, MotionBelow, axes_of
 from dt_viz.errors import check_between
 from dt_viz.flows.diffeomorphisms import AUTO, Chain, Diffeomorphism, Flow, Identity, Integration
 from dt_viz.flows.fields import Array, PlacedField, Projected, VectorField
@@ -61,20 +49,10 @@ with equal steps is quicker here than steps of each point's own length, and ther
 MAX_TARGET_MISS = 0.013
 """Largest distance by which avoiding motions may miss the target without a warning, metres: a centimetre, and the
 error of the arm's joints, interpolated between samples, during a drag."""
-PLACED_BESIDE = 0.08
-"""Distance of a new bias point from the mean path, metres."""
-APART = 0.25
-"""Wanted distance of a new bias point from the others, metres: about the size of a region."""
-ROOM, LEAST_ROOM = 0.11, 0.04
-"""Distances of a new bias point from obstacles, metres: beyond what is carried aside, and where that is nowhere."""
-PLACES = (0.50, 0.30, 0.70, 0.20, 0.80, 0.40, 0.60)
-"""Places along the mean path, as fractions of its length, beside which new bias points are placed."""
-SMALLEST_REGION, LARGEST_REGION = 0.04, 0.40
-"""Smallest and largest radius of a region that can be chosen on the page, metres."""
 
 
 @dataclass(frozen=True)
-class BiasPoint(Transform):
+class BiasPoint(Anchored):
     """Motions are pulled towards a place.
 
     With the goal where it is, every motion passes the place on its way. If the goal moves, it does so to the place.
@@ -99,54 +77,11 @@ class BiasPoint(Transform):
     integration: Integration = AUTO
     """Integration of the flow."""
 
-    title: ClassVar[str] = "Bias"
-    hint: ClassVar[str] = "a point that every motion passes, or ends at"
-    flow_time: ClassVar[str] = "strength"
-    settings: ClassVar[tuple[Setting, ...]] = (
-        Number(
-            "radius",
-            "Radius",
-            "[cm]",
-            100 * SMALLEST_REGION,
-            100 * LARGEST_REGION,
-            0.5,
-            15.0,
-            scale=100.0,
-            automatic=True,
-            hint="radius of the region in which it acts; auto: from the distance of the motion",
-        ),
-        Switch("moves_goal", "Moves the goal", "motions end here instead of at the goal"),
-        Number("strength", "Strength", "t", 0.0, MAX_DURATION, 0.01, 0.5, automatic=True, of_flow=True),
-        FlowIntegration(),
-    )
-
     def __post_init__(self) -> None:
         if self.radius is not None:
             check_between("radius", self.radius, 1e-3, 100.0)
         if self.strength is not None:
             check_between("strength", self.strength, 0.0, MOST_DURATION)
-
-    @property
-    def anchor(self) -> Point:
-        return self.position
-
-    @property
-    def anchor_plane(self) -> tuple[Point, Point] | None:
-        return self.plane
-
-    def in_plane(self, plane: tuple[Point, Point]) -> BiasPoint:
-        return replace(self, plane=plane)
-
-    @property
-    def region(self) -> float | None:
-        return self.radius
-
-    @property
-    def ends_motions(self) -> bool:
-        return self.moves_goal
-
-    def anchored(self, place: Point) -> BiasPoint:
-        return replace(self, position=place)
 
     def axes(self) -> Array:
         """(3, 3) orthonormal columns, those of the plane first."""
@@ -242,11 +177,11 @@ class BiasPoint(Transform):
         steps = max(1, math.ceil(duration / (STEP * tolerance**0.25)))
         return self.integration.of(Flow(field, duration, steps))
 
-    def satisfied(self, motion: MotionBelow) -> bool:
-        """Whether every motion passes close to the target, where that is to be seen to."""
+    def satisfied(self, motion: MotionBelow, top: Array) -> bool:
+        """Whether every motion passes close to the target, at the top, where that is to be seen to."""
         if self.strength is not None:
             return True
-        return bool((self.distances(motion) <= ACCEPTED).all())
+        return bool((self.distances(replace(motion, positions=top)) <= ACCEPTED).all())
 
     def shortfall(self, motion: MotionBelow, made: Built, *, satisfied: bool) -> tuple[MotionWarning, ...]:
         if satisfied or made.hopeless:
@@ -258,7 +193,7 @@ class BiasPoint(Transform):
         return (_warning(motion, Kind.UNREACHED, text),)
 
     def deflected(self, motion: MotionBelow, made: Built, who: str) -> tuple[MotionWarning, ...]:
-        """Warnings about motions that pass beside the target to avoid an obstacle; see `Transform`.
+        """Warnings about motions that pass beside the target to avoid an obstacle; see `Anchored`.
 
         In a drawing this counts the depth, too: a motion may leave the plane to get around the obstacle.
         """
@@ -273,46 +208,13 @@ class BiasPoint(Transform):
         text = f"{who} gives way to the obstacle and {does} {1e3 * missed:.0f} mm from it"
         return (_warning(motion, Kind.TARGET_MISSED, text),)
 
-    @classmethod
-    def beside(cls, surroundings: Surroundings) -> BiasPoint:
-        """A bias point beside the mean demonstration, in the middle or where other places and obstacles leave room."""
-        mean, plane = surroundings.mean_path, surroundings.plane
-        normal = np.array([0.0, 0.0, 1.0]) if plane is None else np.cross(*plane)
-        places = []
-        for u in PLACES:
-            k = round((len(mean) - 1) * u)
-            tangent = mean[k + 5] - mean[k - 5]
-            aside = np.cross(tangent, normal)
-            if np.linalg.norm(aside) < 0.1 * np.linalg.norm(tangent):  # straight up or down
-                aside = np.array([1.0, 0.0, 0.0])
-            sides = [mean[k] + sign * PLACED_BESIDE * aside / np.linalg.norm(aside) for sign in (-1, 1)]
-            # first the side that is farther from the rest of the motion
-            places += sorted(sides, key=lambda place: -np.linalg.norm(mean - place, axis=1).min())
-        # off other strokes
-        free = [place for place in places if np.linalg.norm(mean - place, axis=1).min() > PLACED_BESIDE / 2]
-        # two whose regions overlap pull against each other: first where no other one is near, then as far as there is
-        taken = np.asarray(surroundings.anchors).reshape(-1, 3)
-
-        def apart(place: Array) -> float:
-            return float(np.linalg.norm(place - taken, axis=1).min(initial=np.inf))
-
-        room = free
-        for least in (ROOM, LEAST_ROOM):  # where obstacles leave room
-            room = [place for place in free if surroundings.obstacle.signed_distance(place) > least]
-            far = [place for place in room if apart(place) > APART]
-            if far:
-                return cls(as_point(far[0]), plane=plane)
-        return cls(as_point(max(room or free or places, key=apart)), plane=plane)
-
     def distances(self, motion: MotionBelow) -> Array:
         """(R,) metres from the target: of the motions that have a demonstration, or of their ends if the goal moves."""
         motion = motion.demonstrated
-        if motion.top is not None:
-            motion = replace(motion, positions=motion.top)
         if self.moves_goal:
             last = np.r_[np.flatnonzero(np.diff(motion.index)), len(motion.index) - 1]
             return np.linalg.norm(self.offsets(motion.positions[last]), axis=1)
-        return closest_distances(self, motion)
+        return np.linalg.norm(self.offsets(closest_points(self, motion)[0]), axis=1)
 
     def _auto_radius(self, earlier: Built | None, distance: float, ends: float, others: float) -> float:
         """Large for gentle turns, but such that what is to stay where it is stays outside, where that is possible."""
@@ -381,8 +283,3 @@ def closest_points(point: BiasPoint, motion: MotionBelow) -> tuple[Array, Array]
     nearest = motion.positions[k] + part[k, None] * (motion.positions[k + 1] - motion.positions[k])
     tangents = step[k] @ point.axes()[:, : step.shape[1]].T / np.sqrt(np.maximum(squared[k], 1e-300))[:, None]
     return nearest, tangents
-
-
-def closest_distances(point: BiasPoint, motion: MotionBelow) -> Array:
-    """(R,) metres: how close each rollout comes to the target, in the plane if the bias acts in one."""
-    return np.linalg.norm(point.offsets(closest_points(point, motion)[0]), axis=1)

@@ -1,7 +1,7 @@
 """Detours: the way out of an obstacle that all motions around it take, and how it changes while that is dragged.
 
 The motions of a hand (a body of one point) and of an arm (a body of many) choose alike: of all directions that with the
-least detour, and the one that was chosen before while that costs little more. In a drag it turns there gradually.
+least detour, and the one that was chosen before while that costs little more. In a drag it turns at a limited rate.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def escape_directions(
     Returns:
         Unit vectors (3,), one for each distinct escape; all of them where there is a previous one.
     """
-    directions = _around(plane, settings.num_directions)
+    directions = directions_around(plane, settings.num_directions)
     centres, radii = obstacle.cover()
     if velocity is not None and (speed := float(np.linalg.norm(velocity))) > 0:
         ahead = np.arange(0, min(settings.seconds_ahead * speed, settings.metres_ahead), settings.stride)
@@ -121,8 +121,8 @@ def escape_directions(
     return found
 
 
-def _around(plane: Array | None, num: int) -> Array:
-    """Unit vectors (num, 3) all around, in space or in a plane."""
+def directions_around(plane: Array | None, num: int) -> Array:
+    """Unit vectors (num, 3) all around, in space or in the plane of orthonormal columns (3, 2)."""
     if plane is None:
         return golden_spiral(num, 0.5)
     turn = np.linspace(0, 2 * np.pi, num, endpoint=False)
@@ -137,15 +137,18 @@ class Detour:
     side: Array
     """(3,) unit vector, the direction that was chosen."""
     direction: Array
-    """(3,) unit vector of the motions' way out: the same, or on its way there from another one."""
+    """(3,) unit vector, the escape direction of the motions: `side`, or turning to it from that of another side."""
     kept: bool = False
-    """Whether it was carried over from the detour at the obstacle's last pose."""
+    """Whether there was a detour that was carried over from the obstacle's last pose."""
     length: float = 0.0
     """Longest displacement of a motion of the hand along `direction`, metres."""
+    travelled: float | None = None
+    """Distance by which the obstacle has moved since, metres, where the next detour turns from this one at a limited
+    rate; None where it is at its side at once."""
 
     @property
-    def is_there(self) -> bool:
-        """Whether it has turned to its side."""
+    def arrived(self) -> bool:
+        """Whether the motions escape to the side that was chosen."""
         return self.direction is self.side
 
     @property
@@ -154,34 +157,44 @@ class Detour:
         return self.length * self.direction
 
     def turned_from(self, previous: Detour, escapes: Sequence[Array], turning: float) -> Detour:
-        """The detour on its way here from the previous one, by an angle for each metre that the obstacle has moved.
+        """Turn from the previous detour towards this one, by an angle for each metre that the obstacle has moved.
 
         Args:
-            previous: the detour around the same obstacle where it was just before.
+            previous: the detour that is carried over from the obstacle's last pose.
             escapes: (3,) unit vectors, the best one first; see `turned`.
             turning: angle, rad, while the obstacle moves by its radius.
         """
-        angle = turning * travel(previous.obstacle, self.obstacle) / self.obstacle.radius
+        angle = turning * (previous.travelled or 0.0) / self.obstacle.radius
         direction = turned(previous.direction, self.side, angle, escapes)
         return self if direction is self.side else replace(self, direction=direction)
 
 
-def remembered(detours: Sequence[Detour | None], obstacles: Sequence[Obstacle]) -> tuple[Detour | None, ...]:
-    """The detours around obstacles that are dragged, or rest where a drag has ended; None for the others."""
+def carried_over(
+    detours: Sequence[Detour | None], obstacles: Sequence[Obstacle], *, turn: bool = True
+) -> tuple[Detour | None, ...]:
+    """Carry detours over to the obstacles that are dragged, or rest where a drag has ended; None for the others.
+
+    Args:
+        detours: those of the last motion, one for each obstacle, or none.
+        obstacles: the obstacles where they are now.
+        turn: whether motions turn to other sides at a limited rate, as the obstacles move; else they are there at once.
+    """
     if len(detours) != len(obstacles):
         return (None,) * len(obstacles)
 
-    def known(detour: Detour | None, obstacle: Obstacle) -> Detour | None:
+    def carried(detour: Detour | None, obstacle: Obstacle) -> Detour | None:
         moved = math.inf if detour is None else travel(detour.obstacle, obstacle)
-        return detour if detour is not None and moved < NEARBY and (moved > 0 or detour.kept) else None
+        if detour is None or moved >= NEARBY or not (moved > 0 or detour.kept):
+            return None
+        return replace(detour, travelled=moved if turn else None)
 
-    return tuple(known(detour, obstacle) for detour, obstacle in zip(detours, obstacles, strict=True))
+    return tuple(carried(detour, obstacle) for detour, obstacle in zip(detours, obstacles, strict=True))
 
 
 def turned(start: Array, towards: Array, most: float, escapes: Sequence[Array] = ()) -> Array:
-    """The unit vector `start` (3,), turned towards another one by an angle of at most `most`, rad.
+    """Turn the unit vector `start` (3,) towards another one by an angle of at most `most`, rad.
 
-    To the opposite it turns over the first of the `escapes` (3,) that is across both.
+    To the opposite one it turns over the first of the `escapes` (3,) that is across both.
     """
     if start @ towards < OPPOSITE:
         towards = next((escape for escape in escapes if abs(start @ escape) < -OPPOSITE), towards)

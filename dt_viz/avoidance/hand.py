@@ -11,9 +11,9 @@ import numpy as np
 
 from dt_viz.avoidance.avoidance import Avoidance
 from dt_viz.avoidance.clearing import clearing_duration, escape_lengths
-from dt_viz.avoidance.detour import Detour, DetourSettings, remembered
+from dt_viz.avoidance.detour import Detour, DetourSettings, directions_around
 from dt_viz.avoidance.sideways import Encounter, fixing_ends
-from dt_viz.avoidance.transform import Aside, Built, MotionBelow, axes_of, start_warnings
+from dt_viz.avoidance.transform import Built, MotionBelow, Planar, SidewaysFlow, axes_of, start_warnings
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain, Diffeomorphism
 from dt_viz.flows.fields import Array, Mask, Projected, VectorField
 from dt_viz.obstacles.shapes import Obstacle, Point
@@ -27,16 +27,12 @@ SNAPSHOT = 0.05
 of them, so a step is off by micrometres; between the last two checks the duration is interpolated."""
 TOLERANCE = 1e-5
 """Tolerance of a step of the integration up to the duration that is known to be needed, metres."""
-NUM_DEEPEST = 8
-"""Number of samples of each rollout that the duration is chosen for at first."""
-TINY = 1e-12
-"""Smallest distance between samples that counts as a step, metres."""
 ROUNDING = 1e-6
 """Depth that counts as rounding, metres: a motion may end on the surface."""
 ACCEPTED_MARGIN = 0.9
 """Smallest part of the margin that samples between the checked ones may keep."""
 BESIDE = 1e-3
-"""Tolerance of an obstacle's surface, metres, which is only nearly known, and of the depth of a covered start."""
+"""Tolerance of the surface of an obstacle, metres, which is known approximately; also of a covered start's depth."""
 NUM_DIRECTIONS = 360
 """Number of directions of a plane in which a way out of obstacles is searched."""
 TAIL = 2.0
@@ -45,7 +41,7 @@ place: such a path arrives at up to 60° from the straight way out."""
 
 
 @dataclass(frozen=True, init=False)
-class HandAvoidance(Avoidance, space="task"):
+class HandAvoidance(Avoidance, Planar, space="task"):
     """The end effector avoids (sec. 4.4)."""
 
     plane: tuple[Point, Point] | None
@@ -67,9 +63,6 @@ class HandAvoidance(Avoidance, space="task"):
     def acts(self) -> bool:
         return bool(self.obstacles)
 
-    def in_plane(self, plane: tuple[Point, Point]) -> HandAvoidance:
-        return replace(self, plane=plane)
-
     def _field(self) -> VectorField:
         field = self.avoided.field(self.generator, self.temperature)
         if self.plane is None:
@@ -82,8 +75,7 @@ class HandAvoidance(Avoidance, space="task"):
         obstacle = self.avoided
         if self.plane is None or obstacle.signed_distance(goal) >= 0:
             return obstacle.nearest_free(goal)
-        turn = np.linspace(0, 2 * np.pi, NUM_DIRECTIONS, endpoint=False)
-        directions = np.column_stack([np.cos(turn), np.sin(turn)]) @ axes_of(self.plane)[:, :2].T
+        directions = directions_around(axes_of(self.plane)[:, :2], NUM_DIRECTIONS)
         length = escape_lengths(obstacle, goal, directions)
         return goal + length.min() * directions[length.argmin()]
 
@@ -95,27 +87,20 @@ class HandAvoidance(Avoidance, space="task"):
         """
         obstacle = self.avoided
         field = self._field()
-        detours, aside, motion = self._aside(motion)
-        spent = sum(flow.duration for flow in aside)
+        detours, sideways, motion = self._sideways(motion)
+        spent = sum(flow.duration for flow in sideways)
         at_least = max(0.0, motion.at_least - spent)
-        if aside and motion.earlier is not None:
+        if sideways and motion.earlier is not None:
             last = self.integration.of(AdaptiveFlow(field, at_least, motion.tolerance))
             motion = replace(
-                motion, positions=Chain([fixing_ends(first, last) for first in aside]).inverse(motion.positions)
+                motion, positions=Chain([fixing_ends(first, last) for first in sideways]).inverse(motion.positions)
             )
         num_demonstrated = len(motion.demonstrated.starts)
-        covered = np.flatnonzero(_blocked(obstacle, motion))
+        covered = np.flatnonzero(obstacle.signed_distance(motion.starts) < 0)
         warnings = start_warnings(covered, num_demonstrated, Kind.START_COVERED, "inside the obstacle", motion.name)
         duration, hopeless = None if self.duration is None else self.duration - spent, False
         if duration is None:
-            # the deepest samples leave last, or nearly so; if they were not enough at the last attempt, take all
-            depth = np.where(self._avoidable(motion), obstacle.signed_distance(motion.positions), np.inf)
-            if at_least:
-                points = motion.positions[np.isfinite(depth)]
-            else:
-                crests = _crests(motion, depth, field, self._kept_margin(motion))
-                points = np.concatenate([_deepest(motion, depth), crests])
-            margin = self._kept_margin(motion)
+            points, margin = motion.positions[self._avoidable(motion)], self._kept_margin(motion)
             if at_least > 0:
                 points = AdaptiveFlow(field, at_least, TOLERANCE).inverse(points)
             more = clearing_duration(
@@ -133,8 +118,8 @@ class HandAvoidance(Avoidance, space="task"):
                     text = f"a motion does not leave the obstacle: {why}"
                     warnings.append(motion.warning(Kind.STAYS_INSIDE, text))
         flow: Diffeomorphism = self.integration.of(AdaptiveFlow(field, duration, motion.tolerance))
-        if aside:
-            flow = Chain([*(fixing_ends(first, flow) for first in aside), flow])
+        if sideways:
+            flow = Chain([*(fixing_ends(first, flow) for first in sideways), flow])
         goal = self._nearest_free(motion.goal) if motion.keeps_goal else flow.inverse(motion.goal)
         if obstacle.signed_distance(motion.goal) < 0:
             inside = -float(obstacle.signed_distance(goal))
@@ -142,24 +127,24 @@ class HandAvoidance(Avoidance, space="task"):
             warnings.append(motion.warning(Kind.GOAL_COVERED, f"the goal is inside the obstacle: motions {end}"))
         duration += spent
         chosen = {"duration": duration}
-        return Built(flow, duration, goal, hopeless, tuple(warnings), self.integration, chosen, detours, aside)
+        return Built(flow, duration, goal, hopeless, tuple(warnings), self.integration, chosen, detours, sideways)
 
-    def _aside(self, motion: MotionBelow) -> tuple[tuple[Detour | None, ...], tuple[Aside, ...], MotionBelow]:
+    def _sideways(self, motion: MotionBelow) -> tuple[tuple[Detour | None, ...], tuple[SidewaysFlow, ...], MotionBelow]:
         """Return detours around the obstacles, the flows that carry all motions to one side of each, and these there.
 
         Further attempts take those of the first, with the motion before them: for starts that the flows have moved into
         the obstacle they would be longer, and move these farther. A flow time by hand is spent on these first. In a
-        plane no way out turns from one side to the other, so none is remembered there. The paper's generator acts
+        plane no way out turns from one side to the other, so none is carried over there. The paper's generator acts
         alone.
         """
         if motion.earlier is not None:
-            return motion.earlier.detours, motion.earlier.aside, motion
+            return motion.earlier.detours, motion.earlier.sideways, motion
         detours: list[Detour | None] = [None] * len(self.obstacles)
-        aside: list[Aside] = []
+        sideways: list[SidewaysFlow] = []
         if self.generator == "probability":
             return tuple(detours), (), motion
         plane = None if self.plane is None else axes_of(self.plane)[:, :2]
-        known = remembered(motion.detours if plane is None else (), self.obstacles)
+        known = motion.detours if motion.detours and plane is None else (None,) * len(self.obstacles)
         margin = self._kept_margin(motion.demonstrated)
         left = math.inf if self.duration is None else self.duration
         for k, (obstacle, previous) in enumerate(zip(self.obstacles, known, strict=True)):
@@ -167,16 +152,16 @@ class HandAvoidance(Avoidance, space="task"):
             met = Encounter.of(seen, self._avoidable(seen), obstacle, margin, self.obstacles[:k], plane)
             if met is None:
                 continue
-            detours[k] = detour = met.detour(previous, self.detour, gradually=motion.gradual)
+            detours[k] = detour = met.detour(previous, self.detour)
             flow = met.flow(detour.direction, motion.tolerance)
             flow = self.integration.of(replace(flow, duration=min(flow.duration, left)))
             left -= flow.duration
             if flow.duration > 0:
-                aside.append(flow)
+                sideways.append(flow)
                 motion = replace(motion, positions=flow.inverse(motion.positions))
-        return tuple(detours), tuple(aside), motion
+        return tuple(detours), tuple(sideways), motion
 
-    def satisfied(self, motion: MotionBelow) -> bool:
+    def satisfied(self, motion: MotionBelow, top: Array) -> bool:
         """Return whether all avoidable samples keep (almost) the margin; true for any flow time by hand."""
         if self.duration is not None:
             return True
@@ -233,7 +218,7 @@ class HandAvoidance(Avoidance, space="task"):
         goal_covered = motion.keeps_goal and obstacle.signed_distance(motion.goal) < 0
         instead = self._nearest_free(motion.goal) if goal_covered else motion.goal
         avoidable = np.ones(len(free), dtype=bool)
-        for rollout, blocked in enumerate(_blocked(obstacle, motion)):
+        for rollout, blocked in enumerate(obstacle.signed_distance(motion.starts) < 0):
             if not (blocked or goal_covered):
                 continue
             rows = np.flatnonzero(motion.index == rollout)
@@ -247,33 +232,3 @@ class HandAvoidance(Avoidance, space="task"):
                 tail[: outside[-1] + 1 if len(outside) else 0] = False
                 avoidable[rows[tail]] = False
         return avoidable
-
-
-def _blocked(obstacle: Union, motion: MotionBelow) -> Mask:
-    """Return which rollouts (R,) start inside the obstacle."""
-    return obstacle.signed_distance(motion.starts) < 0
-
-
-def _deepest(motion: MotionBelow, depth: Array) -> Array:
-    """Return the deepest samples (M, 3) of each rollout; `depth` (N,), metres, is infinite for excluded ones."""
-    order = np.lexsort([depth, motion.index])
-    rank = np.arange(len(order)) - np.searchsorted(motion.index, motion.index)
-    return motion.positions[order[(rank < NUM_DEEPEST) & np.isfinite(depth[order])]]
-
-
-def _crests(motion: MotionBelow, depth: Array, field: VectorField, margin: float) -> Array:
-    """Find places (M, 3) between samples of the rollouts at which the field turns from leading onwards to leading back.
-
-    The field is a gradient, or nearly so: its potential is largest there, and points there leave last.
-    """
-    s, step = motion.positions, np.diff(motion.positions, axis=0)
-    near, same = depth < margin, np.diff(motion.index) == 0
-    k = np.flatnonzero(same & near[:-1] & near[1:])
-    here, there = (field(np.concatenate([s[k], s[k + 1]])) * np.tile(step[k], (2, 1))).sum(axis=1).reshape(2, -1)
-    turns = (here > 0) & (there < 0)
-    k, part = k[turns], (here / np.where(turns, here - there, 1))[turns, None]
-    # between two samples a path bends like the parabolas through them and the ones beside them; lengths tell them apart
-    length = np.maximum(np.linalg.norm(step, axis=1, keepdims=True), TINY)
-    bend, inner = np.zeros_like(s), (same[:-1] & same[1:])[:, None]
-    bend[1:-1] = np.diff(step / length, axis=0) / (length[:-1] + length[1:]) * inner
-    return s[k] + part * step[k] - part * (1 - part) * length[k] ** 2 * (bend[k] + bend[k + 1]) / 2

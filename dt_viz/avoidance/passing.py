@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from dt_viz.avoidance.detour import Detour, remembered, travel
+from dt_viz.avoidance.detour import Detour, carried_over
 from dt_viz.obstacles.shapes import Obstacle
 
 Stance = tuple[float, float, float, float, float, float]
@@ -31,12 +31,11 @@ class Passing:
 
     def goes_on(self, obstacles: Sequence[Obstacle]) -> bool:
         """Return whether an obstacle that the whole arm passed is still there, or nearby."""
-        return any(remembered(self.arm, obstacles))
+        return any(carried_over(self.arm, obstacles))
 
     def follows(self, obstacles: Sequence[Obstacle]) -> bool:
         """Return whether such an obstacle has moved a little."""
-        known = zip(remembered(self.arm, obstacles), obstacles, strict=True)
-        return any(detour is not None and travel(detour.obstacle, part) > 0 for detour, part in known)
+        return any(detour is not None and detour.travelled for detour in carried_over(self.arm, obstacles))
 
 
 ANEW = Passing()

@@ -19,7 +19,7 @@ import numpy as np
 
 from dt_viz.avoidance.clearing import escape_lengths
 from dt_viz.avoidance.detour import Detour, DetourSettings, escape_directions
-from dt_viz.avoidance.transform import Aside, MotionBelow
+from dt_viz.avoidance.transform import MotionBelow, SidewaysFlow
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Diffeomorphism
 from dt_viz.flows.fields import Array, Mask, PointField
 from dt_viz.kernels.fields import ASIDE, TERM, Terms
@@ -29,7 +29,7 @@ from dt_viz.obstacles.union import Union
 MAX_SAMPLES = 96
 """Largest number of samples that sides are compared by."""
 BREADTH = 0.7
-"""Smallest half size of A⁻¹, relative to the longest way to the side; else it is the obstacle's plus the margin."""
+"""Smallest half size of A⁻¹, relative to the largest displacement; else it is the obstacle's plus the margin."""
 GAIN = 2.0
 """g in mean half sizes of the obstacle, so that a motion through its middle takes somewhat less than a unit of time."""
 ASLEEP = 3.0
@@ -40,9 +40,9 @@ margin itself, and the field is not to jump there."""
 SLOWEST = 0.3
 """Smallest speed, in g, that the duration allows for: samples beside an end are hardly carried."""
 LONGEST = 2.0
-"""Longest time of the flow, in the same unit: beside covered starts a longer one would squeeze space to nothing."""
+"""Longest flow time: beside covered starts a longer one would squeeze space to nothing."""
 SIMPSON = np.array([1, *[4, 2] * 7, 4, 1]) / 48
-"""Weights of Simpson's rule, along the way of a sample to the side."""
+"""Weights of Simpson's rule, along the displacement of a sample."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,13 +73,13 @@ class Sideways(PointField):
         return Terms(term, values)
 
 
-def fixing_ends(aside: Aside, outer: Diffeomorphism) -> Aside:
-    """The flow `aside` to a side, zero not at its ends but at their images under `outer`, which is stacked on it.
+def fixing_ends(flow: SidewaysFlow, outer: Diffeomorphism) -> SidewaysFlow:
+    """The flow to a side, zero not at its ends but at their images under `outer`, which is stacked on it.
 
     So `outer` alone moves the ends. Where it brought them into the field, that would carry them far into the obstacle.
     """
-    assert isinstance(aside.field, Sideways)
-    return replace(aside, field=replace(aside.field, ends=outer.forward(aside.field.ends)))
+    assert isinstance(flow.field, Sideways)
+    return replace(flow, field=replace(flow.field, ends=outer.forward(flow.field.ends)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +96,7 @@ class Encounter:
     ends: Array
     """(E, 3) starts and goal outside the obstacle, metres."""
     others: tuple[Obstacle, ...] = ()
-    """Obstacles whose sides have been chosen: the way out of this one does not end in them."""
+    """Obstacles whose sides have been chosen: the escape from this one does not end in them."""
     plane: Array | None = None
     """(3, 2) orthonormal columns: sides are in this plane; None is in space."""
 
@@ -124,16 +124,15 @@ class Encounter:
         ends = ends[obstacle.signed_distance(ends) >= 0]
         return cls(obstacle, margin, motion.positions[inside], tangents, ends, tuple(others), plane)
 
-    def detour(self, previous: Detour | None, settings: DetourSettings, *, gradually: bool) -> Detour:
-        """Choose the way out, on the side with the least detour, or the previous one while that costs little more.
+    def detour(self, previous: Detour | None, settings: DetourSettings) -> Detour:
+        """Choose the side with the least detour, or the previous one while that costs little more.
 
-        Where turning there gradually would move the motions farther than going there at once, it is there at once: what
-        has just come near may make the way long in between.
+        Where turning there at a limited rate would move the motions farther than going there at once, it is there at
+        once: what has just come near may make the way long in between.
 
         Args:
-            previous: the detour around the obstacle where it was just before; None where there was none.
+            previous: the detour that is carried over from the obstacle's last pose; None where there was none.
             settings: how it is chosen.
-            gradually: whether it turns there as the obstacle moves on; else it is there at once.
         """
         found = escape_directions(
             self.points.T[None],
@@ -146,10 +145,10 @@ class Encounter:
             plane=self.plane,
             settings=settings,
         )
-        there = self._measured(Detour(self.obstacle, found[0], found[0], kept=previous is not None))
-        if previous is None or not gradually:
-            return there
-        both = there, self._measured(there.turned_from(previous, found, settings.turning))
+        arrived = self._measured(Detour(self.obstacle, found[0], found[0], kept=previous is not None))
+        if previous is None or previous.travelled is None:
+            return arrived
+        both = arrived, self._measured(arrived.turned_from(previous, found, settings.turning))
         return min(both, key=lambda detour: float(np.linalg.norm(detour.offset - previous.offset)))
 
     def _measured(self, detour: Detour) -> Detour:
@@ -157,30 +156,25 @@ class Encounter:
 
     def flow(self, direction: Array, tolerance: float) -> AdaptiveFlow:
         """The flow whose inverse carries all samples along a unit vector (3,) until they keep the margin."""
-        way = self._lengths(direction)
-        centre, axes = _ellipsoid(self.obstacle)
+        length = self._lengths(direction)
+        ellipsoid = self.obstacle.field("free-space", 1.0)  # with half axes as columns, metres, about as large
+        centre, axes = ellipsoid.origin, ellipsoid.axes
         half = np.linalg.norm(axes, axis=0)
-        inverse = np.linalg.inv(axes * (np.maximum(half + self.margin, BREADTH * way.max()) / half))
+        inverse = np.linalg.inv(axes * (np.maximum(half + self.margin, BREADTH * length.max()) / half))
         ends = self.ends[np.linalg.norm((self.ends - centre) @ inverse.T, axis=1) < ASLEEP]
         distance = np.linalg.norm(self.points[:, None] - ends, axis=2).min(axis=0)
         gain = GAIN * float(half.mean())
         field = Sideways(centre, inverse, gain * direction, ends, np.maximum(END_RADIUS * distance, LEAST_END_RADIUS))
-        on_the_way = self.points + (np.linspace(0, 1, len(SIMPSON))[:, None] * way)[:, :, None] * direction
-        speed = -(field(on_the_way.reshape(-1, 3)) @ direction).reshape(len(SIMPSON), -1)
-        duration = way * (SIMPSON @ (1 / np.maximum(speed, SLOWEST * gain)))
+        passed = self.points + (np.linspace(0, 1, len(SIMPSON))[:, None] * length)[:, :, None] * direction
+        speed = -(field(passed.reshape(-1, 3)) @ direction).reshape(len(SIMPSON), -1)
+        duration = length * (SIMPSON @ (1 / np.maximum(speed, SLOWEST * gain)))
         return AdaptiveFlow(field, min(float(duration.max()), LONGEST), tolerance)
 
     def _lengths(self, direction: Array) -> Array:
-        """How far (K,), metres, the samples have to go along a unit vector (3,) to keep the margin."""
+        """Lengths (K,), metres, by which the samples are displaced along a unit vector (3,) to keep the margin."""
         return escape_lengths(self._around, self.points, direction, self.margin)
 
     @property
     def _around(self) -> Union:
-        """The obstacle, and those that the way out does not end in."""
+        """The obstacle, and those that the escape does not end in."""
         return Union((self.obstacle, *self.others))
-
-
-def _ellipsoid(obstacle: Obstacle) -> tuple[Array, Array]:
-    """Centre (3,) and half axes (3, 3), as columns, metres, of an ellipsoid about as large as an obstacle."""
-    placed = obstacle.field("free-space", 1.0)
-    return placed.origin, placed.axes

@@ -9,7 +9,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -22,8 +21,8 @@ from dt_viz.warning import Kind, MotionWarning
 
 MOST_DURATION = 100.0
 """Longest flow time that a transform may have."""
-Aside = AdaptiveFlow | Flow
-"""Flow along a way out of an obstacle."""
+SidewaysFlow = AdaptiveFlow | Flow
+"""Flow in one direction out of an obstacle; see `dt_viz.avoidance.sideways`."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +45,6 @@ class MotionBelow:
     """The transform as an earlier attempt made it for nearly this motion; None at the first one."""
     above: Diffeomorphism | None = None
     """ψ from the top of the stack to the manifold of the transform, as far as it has been built."""
-    top: Array | None = None
-    """(N, 3) the same samples at the top of the stack, where the robot moves, metres; None before it is built."""
     keeps_goal: bool = True
     """Whether transforms that are not meant to move the goal must keep it."""
     num_demonstrated: int | None = None
@@ -55,9 +52,8 @@ class MotionBelow:
     targets: tuple[Point, ...] = ()
     """Places that transforms further down lead the motions to, metres."""
     detours: tuple[Detour | None, ...] = ()
-    """Detours around the transform's obstacles to keep while these are dragged; see `dt_viz.avoidance.passing`."""
-    gradual: bool = False
-    """Whether these turn to where they are to be as the obstacles move on; else they are there at once."""
+    """Detours around the transform's obstacles that are carried over from before these were dragged to where they are;
+    empty without any. See `dt_viz.avoidance.detour.carried_over`."""
 
     @property
     def at_least(self) -> float:
@@ -71,9 +67,7 @@ class MotionBelow:
         if num is None or num == len(self.starts):
             return self
         rows = slice(np.searchsorted(self.index, num))
-        top = None if self.top is None else self.top[rows]
-        samples = {"index": self.index[rows], "positions": self.positions[rows], "top": top}
-        return replace(self, starts=self.starts[:num], **samples)
+        return replace(self, starts=self.starts[:num], index=self.index[rows], positions=self.positions[rows])
 
     def warning(self, kind: Kind, text: str) -> MotionWarning:
         """Return a warning about the transform that changes this motion."""
@@ -99,74 +93,9 @@ class Built:
     chosen: Mapping[str, float] = field(default_factory=dict, compare=False)
     """Values that were chosen automatically, by the transform's fields."""
     detours: tuple[Detour | None, ...] = field(default=(), compare=False)
-    """Ways around the obstacles that it avoids; None of those that are not in the way."""
-    aside: tuple[Aside, ...] = field(default=(), compare=False)
+    """Detours around the obstacles that it avoids; None of those that are not in the way."""
+    sideways: tuple[SidewaysFlow, ...] = field(default=(), compare=False)
     """Flows along these, which come before its own."""
-
-
-@dataclass(frozen=True)
-class Number:
-    """A setting that is a slider on the page."""
-
-    field: str
-    """Name of the transform's field."""
-    label: str
-    unit: str
-    low: float
-    high: float
-    step: float
-    initial: float
-    """Value of the slider before there is one."""
-    scale: float = 1.0
-    """Units of the slider in one unit of the field."""
-    automatic: bool = False
-    """Whether a switch beside the slider sets the field to None, which leaves the choice to the transform."""
-    of_flow: bool = False
-    """Whether it is t of the transform's flow."""
-    hint: str = ""
-
-
-@dataclass(frozen=True)
-class Switch:
-    """A setting that is on or off."""
-
-    field: str
-    label: str
-    hint: str = ""
-
-
-@dataclass(frozen=True, eq=False)
-class Choice:
-    """A setting that is one of a few values."""
-
-    field: str
-    label: str
-    options: Mapping[Any, str]
-    """Names of the values."""
-    hint: str = ""
-
-
-@dataclass(frozen=True)
-class FlowIntegration:
-    """The setting of a field of type `Integration`."""
-
-    field: str = "integration"
-
-
-Setting = Number | Switch | Choice | FlowIntegration
-
-
-@dataclass(frozen=True)
-class Surroundings:
-    """The world around a transform that is added."""
-
-    mean_path: Array
-    """(T, 3) the mean demonstration, evenly sampled, metres."""
-    plane: tuple[Point, Point] | None
-    """Two orthonormal vectors of a drawing's plane; None of a task in space."""
-    obstacle: Union
-    anchors: tuple[Point, ...]
-    """Places of other transforms, metres."""
 
 
 @lru_cache(maxsize=64)
@@ -180,34 +109,13 @@ def axes_of(plane: tuple[Point, Point] | None) -> Array:
     return axes
 
 
-_Transform = TypeVar("_Transform", bound="Transform")
-
-
+@dataclass(frozen=True)
 class Transform(ABC):
     """A kind of transform that can be stacked; subclasses are frozen dataclasses, compared by their fields."""
-
-    title: ClassVar[str] = ""
-    """Name on the page; numbered where there may be more than one."""
-    hint: ClassVar[str] = ""
-    """Explanation of the button that adds one."""
-    most: ClassVar[int] = 4
-    """Largest number in a stack of the page."""
-    settings: ClassVar[tuple[Setting, ...]] = ()
-    """Settings that the page offers."""
-    flow_time: ClassVar[str] = "t"
-    """Name of t in the list of the stack."""
-    stays_outermost: ClassVar[bool] = False
-    """Whether transforms that are added go below it."""
-    yields_goal: ClassVar[bool] = False
-    """Whether motions may end elsewhere if it finds no way that keeps the goal."""
 
     @abstractmethod
     def build(self, motion: MotionBelow) -> Built:
         """Build the diffeomorphism for this motion."""
-
-    def satisfied(self, motion: MotionBelow) -> bool:
-        """Return whether the samples of `motion`, taken after the transform, behave as wanted."""
-        return True
 
     @property
     def acts(self) -> bool:
@@ -216,36 +124,17 @@ class Transform(ABC):
 
     @cached_property
     def avoided(self) -> Union:
-        """The obstacles that it leads motions around."""
+        """The obstacles that it leads motions around; if these leave no way to the goal, motions may end beside it."""
         return Union()
 
-    @property
-    def anchor(self) -> Point | None:
-        """Place that it leads motions to and by which it is dragged, metres."""
-        return None
+    def satisfied(self, motion: MotionBelow, top: Array) -> bool:
+        """Return whether motions behave as wanted.
 
-    @property
-    def anchor_plane(self) -> tuple[Point, Point] | None:
-        """Two orthonormal vectors of the plane that it is dragged in; None of space."""
-        return None
-
-    @property
-    def region(self) -> float | None:
-        """Radius of the region around its anchor in which it acts, metres; None where that is chosen automatically."""
-        return None
-
-    def anchored(self: _Transform, place: Point) -> _Transform:
-        """Return the same transform with its anchor at `place`, metres."""
-        return self
-
-    @property
-    def ends_motions(self) -> bool:
-        """Whether motions are to end at its anchor."""
-        return False
-
-    def in_plane(self: _Transform, plane: tuple[Point, Point]) -> _Transform:
-        """Return the same transform, acting only along a plane, given by two orthonormal vectors."""
-        return self
+        Args:
+            motion: their samples just above the transform.
+            top: (N, 3) the same samples at the top of the stack, where the robot moves, metres.
+        """
+        return True
 
     def shortfall(self, motion: MotionBelow, made: Built, *, satisfied: bool) -> tuple[MotionWarning, ...]:
         """Return warnings about wishes of the transform that are not met.
@@ -259,6 +148,24 @@ class Transform(ABC):
             return ()
         return (motion.warning(Kind.UNREACHED, f"{motion.name}: not every motion does what it asks for"),)
 
+
+class Planar(Transform):
+    """A transform that may act along a plane only."""
+
+    plane: tuple[Point, Point] | None
+    """Two orthonormal vectors of that plane; None is in space."""
+
+
+class Anchored(Planar):
+    """A transform that leads motions to a place, by which it is dragged in the scene; in its plane if it has one."""
+
+    position: Point
+    """The place, metres."""
+    radius: float | None
+    """Radius of the region around the place in which it acts, metres; None where that is chosen automatically."""
+    moves_goal: bool
+    """Whether motions are to end at the place."""
+
     def deflected(self, motion: MotionBelow, made: Built, who: str) -> tuple[MotionWarning, ...]:
         """Return warnings about wishes that are no longer met because obstacles are avoided.
 
@@ -268,11 +175,6 @@ class Transform(ABC):
             who: name of who gives way, for the text.
         """
         return ()
-
-    @classmethod
-    def beside(cls: type[_Transform], surroundings: Surroundings) -> _Transform:
-        """Return the transform that the page adds."""
-        return cls()
 
 
 def start_warnings(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dt_viz.avoidance.avoidance import ArmAvoidance
+from dt_viz.avoidance.registry import AVOIDANCE
 from dt_viz.baselines.base import Method, Plan, Planner, Problem
 from dt_viz.errors import Cancelled, never
 from dt_viz.flows.fields import Array
@@ -75,7 +76,7 @@ class _WholeArmPlanner:
         admission = self.follower.admission(nominal, avoidance)
         if admission.blocked:
             return {}
-        scenario = Scenario(nominal.task.name, (Layer(avoidance, name=avoidance.title),))
+        scenario = Scenario(nominal.task.name, (Layer(avoidance, name=AVOIDANCE.title),))
         solved = solve(scenario, admission.nominal, self.precision, self.follower)
         arm = solved.arm
         if solved.blocked or arm is None:

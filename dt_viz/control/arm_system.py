@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from dt_viz.avoidance.arm_field import COMPLEX_STEP
 from dt_viz.flows.diffeomorphisms import Diffeomorphism
 from dt_viz.flows.fields import Array
 from dt_viz.flows.systems import DiffeomorphicSystem
+from dt_viz.kernels.proximity import COMPLEX_STEP
 from dt_viz.robot.inverse_kinematics import soft_limits, track
 from dt_viz.robot.robot import NUM_JOINTS, Robot
 

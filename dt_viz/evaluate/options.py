@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from dt_viz.avoidance.hand import Avoidance
+from dt_viz.avoidance.registry import AVOIDANCE
 from dt_viz.folders import default_cache_folder
 from dt_viz.learning.store import FitStore
 from dt_viz.robot.robot import load_jaco
@@ -66,7 +67,7 @@ def new_engine(tasks: Mapping[str, TaskEntry]) -> Engine:
 
 def avoiding(task: Task, avoidance: Avoidance, *, on: bool = True) -> Scenario:
     """Return the scenario of a task with an avoidance, switched on or off, on its imitation."""
-    return Scenario(task.name, (Layer(avoidance, on, avoidance.title),))
+    return Scenario(task.name, (Layer(avoidance, on, AVOIDANCE.title),))
 
 
 def whole_number(minimum: int) -> Callable[[str], int]:

@@ -51,7 +51,7 @@ def block_of(*rows: tuple[str, tuple[int, ...]]) -> np.dtype:
     return np.dtype([(name, np.float64, (*shape, LANES)) for name, shape in (*kinematics, *rows)])
 
 
-BLOCK = block_of(("nearest", ()))
+BLOCK = block_of(("floor", ()), ("bound", ()))
 """Memory for `clearance`."""
 Blocks = NDArray[np.void]
 """(1,) block of such a dtype."""
@@ -273,39 +273,43 @@ def room_asked(q: Array, pins: Array, room: Array, levers: Array, slope: float, 
 
 
 @short_kernel
-def clearance(joints: Joints, points: BodyPoints, shapes: Shapes, values: Values, q: Array, enough: Array) -> Array:
+def clearance(
+    joints: Joints, points: BodyPoints, shapes: Shapes, values: Values, q: Array, lowest: Array, highest: Array
+) -> Array:
     """Smallest distance (N,), metres, of body points' spheres from any of the obstacles, at angles q (N, n), rad.
 
-    From `enough` (N,) on it is that.
+    It is cut off at `lowest` (N,) and `highest` (N,): what is beyond takes less time.
     """
-    result, memory = enough.copy(), np.empty(1, BLOCK)
+    result, memory = highest.copy(), np.empty(1, BLOCK)
     likely = np.full(len(shapes), len(points) - 1)  # what was nearest just before: most bounds are beyond it
     block = memory[0]
-    away, nearest = block.away, block.nearest
+    away, floor, bound = block.away, block.floor, block.bound
     for first in range(0, len(q), LANES):
         num = load(block, q, first)
         chain(joints, block)
         for lane in range(LANES):
-            nearest[lane] = enough[first + min(lane, num - 1)]
+            row = first + min(lane, num - 1)
+            floor[lane], bound[lane] = lowest[row], highest[row]
         for k in range(len(shapes)):
             tried, p = False, 0
             while p < len(points):
                 at = p if tried else likely[k]
-                most = _largest(nearest)
+                most = _largest(bound)
                 put(points[at].offset, points[at].joint, block)
                 measure(shapes[k], values, points[at].radius, most, block)
                 nearer = 0
                 for lane in range(LANES):
-                    nearer += away[lane] < nearest[lane]
+                    nearer += away[lane] < bound[lane]
                 if not holds_others(points, at):
-                    if away[0] < nearest[0]:
+                    if away[0] < bound[0]:
                         likely[k] = at
                     for lane in range(LANES):
-                        nearest[lane] = away[lane] if away[lane] < nearest[lane] else nearest[lane]
+                        closer = away[lane] if away[lane] < bound[lane] else bound[lane]
+                        bound[lane] = closer if closer > floor[lane] else -np.inf
                 if tried:
                     p = p + 1 if nearer > 0 else points[p].end
                 tried = True
         for lane in range(num):
-            result[first + lane] = nearest[lane]
+            result[first + lane] = max(bound[lane], lowest[first + lane])
     keep(memory)
     return result

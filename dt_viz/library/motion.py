@@ -17,7 +17,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dt_viz.avoidance.transform import Transform
+from dt_viz.avoidance.registry import entry_of
+from dt_viz.avoidance.transform import Planar, Transform
 from dt_viz.errors import FormatError, check_between
 from dt_viz.flows.augmented_systems import frozen
 from dt_viz.flows.fields import Array, Indices
@@ -79,9 +80,10 @@ class Motion:
         """
         scenario = self.scenario
         for transform in transforms:
-            flat = transform.in_plane(PLANE) if self.dimension == 2 else transform
-            names = {layer.name for layer in scenario.stack}
-            name = next(name for k in range(1, len(names) + 2) if (name := f"{flat.title} {k}") not in names)
+            planar = self.dimension == 2 and isinstance(transform, Planar)
+            flat = replace(transform, plane=PLANE) if planar else transform
+            names, title = {layer.name for layer in scenario.stack}, entry_of(flat).title
+            name = next(name for k in range(1, len(names) + 2) if (name := f"{title} {k}") not in names)
             scenario = replace(scenario, stack=(*scenario.stack, Layer(flat, name=name)))
         return Motion(self._learned, scenario.stack)
 

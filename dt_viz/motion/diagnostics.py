@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from dt_viz.avoidance.arm_field import LEVERS
-from dt_viz.avoidance.transform import MotionBelow, start_warnings
+from dt_viz.avoidance.transform import Anchored, MotionBelow, start_warnings
 from dt_viz.flows.diffeomorphisms import Chain, Conjugated, Diffeomorphism, Flow, Integration
 from dt_viz.flows.fields import Array
 from dt_viz.flows.rollouts import MAX_SAMPLES, Bundle
@@ -79,10 +79,12 @@ def _of_arm(solved: Solved) -> list[MotionWarning]:
 def anchor_warnings(stack: Solution) -> tuple[MotionWarning, ...]:
     """Warnings about transforms that lead motions to where the arm's hand cannot be."""
     said = []
-    for name, anchor in ((applied.name, applied.transform.anchor) for applied in stack.built):
-        if anchor is not None and anchor[2] < 0:
+    for name, transform in ((applied.name, applied.transform) for applied in stack.built):
+        if not isinstance(transform, Anchored):
+            continue
+        if transform.position[2] < 0:
             said.append((name, "the point is below the table"))
-        away = 0.0 if anchor is None else float(np.linalg.norm(np.subtract(anchor, SHOULDER)))
+        away = float(np.linalg.norm(np.subtract(transform.position, SHOULDER)))
         if away > REACH:
             said.append((name, f"the point is {away:.2f} m from the arm's shoulder, which reaches {REACH:.2f} m"))
     return tuple(MotionWarning(Kind.MISPLACED, f"{name}: {text}", name) for name, text in said)
@@ -103,7 +105,7 @@ def target_warnings(solved: Solved, drawn: DrawnSamples) -> tuple[MotionWarning,
     return tuple(
         warning
         for applied in solved.stack.built
-        if applied.satisfied
+        if applied.satisfied and isinstance(applied.transform, Anchored)
         for warning in applied.transform.deflected(_top(solved, applied, drawn), applied.made, who)
     )
 
@@ -147,7 +149,7 @@ def _moves_goal(nominal: Nominal, stack: Solution) -> bool:
     """Whether some transform means to end motions elsewhere."""
     goals = [nominal.goal, *(applied.made.goal for applied in stack.built)]
     moves = (bool(np.any(a != b)) for a, b in pairwise(goals))
-    return any(m and not applied.transform.yields_goal for m, applied in zip(moves, stack.built, strict=True))
+    return any(m and not applied.transform.avoided.parts for m, applied in zip(moves, stack.built, strict=True))
 
 
 def integration_warnings(

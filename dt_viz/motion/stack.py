@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dt_viz.avoidance.detour import Detour
+from dt_viz.avoidance.detour import Detour, carried_over
 from dt_viz.avoidance.passing import ANEW, Passing
-from dt_viz.avoidance.transform import Built, MotionBelow, Transform
+from dt_viz.avoidance.transform import Anchored, Built, MotionBelow, Transform
 from dt_viz.flows.augmented_systems import OnPlaces, frozen, on_places
 from dt_viz.flows.diffeomorphisms import Chain, Diffeomorphism, Identity
 from dt_viz.flows.fields import Array, Indices
@@ -142,7 +142,10 @@ def build_stack(
         precision: how exactly.
         passing: sides to keep while obstacles are dragged.
     """
-    detours = [passing.hand.get(place, ()) for place, _ in layers]
+    detours = [
+        carried_over(passing.hand.get(place, ()), layer.transform.avoided.parts, turn=precision is LIVE)
+        for place, layer in layers
+    ]
     solution, places = None, nominal.learned.places
     for keeps_goal in (True, False):
         rays, bundle = nominal.rays, nominal.bundle
@@ -157,7 +160,6 @@ def build_stack(
                 tolerance=precision.tolerance,
                 keeps_goal=keeps_goal,
                 num_demonstrated=nominal.num_shaping,
-                gradual=precision is LIVE,
             )
             built = _build(layers, lowest, earlier, above, detours)
             above = _above([made for _, made in built])
@@ -176,7 +178,7 @@ def build_stack(
             if not any(applied.may_improve for applied in solution.built):
                 return solution
         assert solution is not None
-        if not any(applied.transform.yields_goal and applied.may_improve for applied in solution.built):
+        if not any(applied.transform.avoided.parts and applied.may_improve for applied in solution.built):
             break  # the goal has nothing to do with it
     assert solution is not None
     return solution
@@ -197,8 +199,8 @@ def _build(
         motion = replace(motion, **told, detours=known)
         made = layer.transform.build(motion)
         built.append((motion, made))
-        if layer.transform.anchor is not None:
-            targets.append(layer.transform.anchor)
+        if isinstance(layer.transform, Anchored):
+            targets.append(layer.transform.position)
         if len(built) < len(layers):
             motion = replace(motion, goal=made.goal, positions=made.transform.inverse(motion.positions))
     return built
@@ -219,7 +221,7 @@ def _applied(
     """The layers as they were made, and whether they find in the bundle what they were made for."""
     found = []
     for (place, layer), (motion, made), outer in zip(layers, built, above, strict=True):
-        at = {"positions": bundle.levels[:, len(found) + 1], "top": bundle.positions, "above": outer}
-        satisfied = layer.transform.satisfied(replace(motion, index=bundle.index, **at))
+        at = {"positions": bundle.levels[:, len(found) + 1], "above": outer}
+        satisfied = layer.transform.satisfied(replace(motion, index=bundle.index, **at), bundle.positions)
         found.append(Applied(place, layer.name, layer.transform, made, satisfied))
     return tuple(found)

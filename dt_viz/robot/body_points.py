@@ -99,14 +99,21 @@ class BodyPoints:
                 positions[points] = turned + chain.origins[joint]
         return positions
 
-    def clearance(self, robot: Robot, q: Array, obstacle: Union | Obstacle, enough: ArrayLike = np.inf) -> Array:
+    def clearance(
+        self,
+        robot: Robot,
+        q: Array,
+        obstacle: Union | Obstacle,
+        highest: ArrayLike = np.inf,
+        lowest: ArrayLike = -np.inf,
+    ) -> Array:
         """Compute distances (N,), metres, of the arm from an obstacle at configurations q (N, 6), rad.
 
-        They are too small by `PROTRUSION` at most, and at most `enough` (N,).
+        They are too small by `PROTRUSION` at most, and cut off at `lowest` and `highest`, each (N,) or one for all.
         """
         shapes, values = records(obstacle.parts if isinstance(obstacle, Union) else (obstacle,))
-        most = np.array(np.broadcast_to(enough, len(q)), dtype=float)
-        return clearance(robot.records, self.spheres, shapes, values, np.array(q, order="C"), most)
+        low, high = (np.array(np.broadcast_to(bound, len(q)), dtype=float) for bound in (lowest, highest))
+        return clearance(robot.records, self.spheres, shapes, values, np.array(q, order="C"), low, high)
 
     @cached_property
     def by_joint(self) -> list[tuple[int, slice]]:

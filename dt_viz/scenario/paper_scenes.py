@@ -11,6 +11,7 @@ import numpy as np
 
 from dt_viz.avoidance.avoidance import ArmAvoidance, Avoidance
 from dt_viz.avoidance.bias import BiasPoint
+from dt_viz.avoidance.registry import AVOIDANCE, BIAS
 from dt_viz.flows.fields import Array, Mask
 from dt_viz.obstacles.clouds import Cloud
 from dt_viz.obstacles.occupancy import sample_labels
@@ -43,7 +44,7 @@ FIG_6_DIAMETER = 0.15
 """Its diameter, metres."""
 FIG_6 = {"compared": ("eflow-repulsive", "linear", "modulation"), "field": False, "ghost": False}
 """View of its scenes: the methods that follow a drag, one of each kind."""
-FIRST_BIAS = f"{BiasPoint.title} 1"
+FIRST_BIAS = f"{BIAS.title} 1"
 """Name of the layer of the first bias point."""
 
 
@@ -77,7 +78,7 @@ class PaperScene:
 
 
 def _avoiding(task: Task, avoidance: Avoidance) -> Scenario:
-    return Scenario(task.name, (Layer(avoidance, name=avoidance.title),))
+    return Scenario(task.name, (Layer(avoidance, name=AVOIDANCE.title),))
 
 
 def _biased(task: Task, *points: BiasPoint) -> Scenario:

@@ -10,6 +10,7 @@ from typing import Any, Literal
 from dt_viz.avoidance.avoidance import ArmAvoidance, Avoidance
 from dt_viz.avoidance.hand import HandAvoidance
 from dt_viz.avoidance.passing import Passing
+from dt_viz.avoidance.registry import AVOIDANCE
 from dt_viz.avoidance.transform import Transform
 from dt_viz.learning.imitation import Objective
 from dt_viz.learning.state import State
@@ -200,7 +201,7 @@ class Layer:
     """Name on the page, unique in the stack."""
 
 
-AVOIDING = (Layer(ArmAvoidance(), name=Avoidance.title),)
+AVOIDING = (Layer(ArmAvoidance(), name=AVOIDANCE.title),)
 """The stack that a scenario begins with: the whole arm avoids."""
 
 

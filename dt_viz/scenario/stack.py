@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from dt_viz.avoidance.avoidance import Avoidance, Space
-from dt_viz.avoidance.transform import Surroundings, Transform
+from dt_viz.avoidance.avoidance import Space
+from dt_viz.avoidance.page import Surroundings
+from dt_viz.avoidance.registry import AVOIDANCE, entry_of
+from dt_viz.avoidance.transform import Anchored, Transform
 from dt_viz.metrics import resample_by_arc_length
 from dt_viz.obstacles.shapes import Point, as_point
 from dt_viz.scenario.panels import BASE_PANEL, Panel
@@ -30,7 +32,7 @@ def place_of(scenario: Scenario, name: str) -> int | None:
 
 def avoidance_layer(scenario: Scenario) -> Layer:
     """Return the layer that the page's obstacles belong to; without one, an empty layer that is off."""
-    none = Layer(scenario.avoidance, on=False, name=Avoidance.title)
+    none = Layer(scenario.avoidance, on=False, name=AVOIDANCE.title)
     return next((layer for layer in scenario.stack if layer.transform is scenario.avoidance), none)
 
 
@@ -67,12 +69,12 @@ def _changed(scenario: Scenario, name: str, **changes: Any) -> Stack:  # noqa: A
 
 
 def with_added(scenario: Scenario, transform: Transform) -> tuple[Stack, str]:
-    """Return the stack with one more transform, below those that stay outermost, and its name."""
-    taken, title = {layer.name for layer in scenario.stack}, transform.title
-    names = (title if transform.most == 1 else f"{title} {k}" for k in range(1, len(taken) + 2))
+    """Return the stack with one more transform, below those that are the only ones of their kind, and its name."""
+    taken, entry = {layer.name for layer in scenario.stack}, entry_of(transform)
+    names = (entry.title if entry.most == 1 else f"{entry.title} {k}" for k in range(1, len(taken) + 2))
     name = next(name for name in names if name not in taken)
     place = len(scenario.stack)
-    while place and scenario.stack[place - 1].transform.stays_outermost:
+    while place and entry_of(scenario.stack[place - 1].transform).most == 1:
         place -= 1
     return (*scenario.stack[:place], Layer(transform, name=name), *scenario.stack[place:]), name
 
@@ -140,14 +142,14 @@ def tuned(scenario: Scenario) -> str:
     return scenario.view.tuned if scenario.view.tuned in names else names[0]
 
 
-def anchored(scenario: Scenario) -> dict[str, Transform]:
+def anchored(scenario: Scenario) -> dict[str, Anchored]:
     """The transforms that have a place of their own, also those that are off, by the name of their layer."""
-    return {layer.name: layer.transform for layer in scenario.stack if layer.transform.anchor is not None}
+    return {layer.name: layer.transform for layer in scenario.stack if isinstance(layer.transform, Anchored)}
 
 
 def added(scenario: Scenario) -> dict[str, Transform]:
     """The transforms of which there may be several, also those that are off, by the name of their layer."""
-    return {layer.name: layer.transform for layer in scenario.stack if layer.transform.most > 1}
+    return {layer.name: layer.transform for layer in scenario.stack if entry_of(layer.transform).most > 1}
 
 
 def selected(scenario: Scenario) -> str | None:
@@ -167,5 +169,5 @@ def plane_of(task: Task) -> tuple[Point, Point] | None:
 def surroundings(task: Task, scenario: Scenario) -> Surroundings:
     """Return the surroundings of a transform that is added."""
     mean = np.mean([resample_by_arc_length(path, 201) for path in task.paths], axis=0)
-    anchors = tuple(transform.anchor for transform in anchored(scenario).values() if transform.anchor is not None)
+    anchors = tuple(transform.position for transform in anchored(scenario).values())
     return Surroundings(mean, plane_of(task), scenario.obstacle, anchors)

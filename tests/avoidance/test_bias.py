@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import avoiding, biases
 
-from dt_viz.avoidance.bias import ACCEPTED, AIM, MAX_DURATION, BiasPoint, closest_distances, closest_points
+from dt_viz.avoidance.bias import ACCEPTED, AIM, MAX_DURATION, BiasPoint, closest_points
 from dt_viz.avoidance.bias_fields import unit_field
 from dt_viz.avoidance.hand import ACCEPTED_MARGIN
 from dt_viz.avoidance.transform import MotionBelow
@@ -52,7 +52,7 @@ def motion_of(nominal, bundle) -> MotionBelow:
 
 
 def missed(nominal, solution, point) -> float:
-    return float(closest_distances(point, motion_of(nominal, solution.bundle)).max())
+    return float(point.distances(motion_of(nominal, solution.bundle)).max())
 
 
 def beside(nominal, rng, plane=None):
@@ -123,7 +123,7 @@ def test_every_rollout_passes_within_a_centimetre_of_targets_up_to_15_cm_off(nom
         solution = biased(g, point, precision=FINE if number % 5 == 0 else LIVE)
         assert satisfied(solution) and solution.warnings == ()
         assert missed(g, solution, point) <= ACCEPTED
-        off.append(closest_distances(point, motion_of(g, g.bundle)).max())
+        off.append(point.distances(motion_of(g, g.bundle)).max())
         turns.append(max(sharpest_turn(path, 0.02) for path in solution.bundle.paths))
         if number % 5 == 0:
             assert_sound(g, solution)
@@ -158,7 +158,7 @@ def test_one_motion_is_shifted_to_the_target(distance, radius):
     (shift,) = Chain([built.transform]).parts
     np.testing.assert_allclose(shift.inverse(np.array([0.0, distance, 0.0])), 0, atol=1e-5)
     after = replace(motion, positions=built.transform.inverse(motion.positions))
-    assert point.satisfied(after) and not point.satisfied(motion)
+    assert point.satisfied(after, after.positions) and not point.satisfied(motion, motion.positions)
 
 
 @settings(max_examples=6)
@@ -171,7 +171,7 @@ def test_several_are_shifted_together_and_gathered_as_briefly_as_can_be(distance
 
     def after(part):
         moved = waist.scaled(part).inverse(shifted)
-        return float(closest_distances(point, replace(motion, positions=moved)).max())
+        return float(point.distances(replace(motion, positions=moved)).max())
 
     assert after(1.0) == pytest.approx(AIM, rel=0.03)
     assert after(0.97) > AIM
@@ -216,7 +216,7 @@ def test_the_closest_point_is_that_of_the_polyline(seed):
     point = BiasPoint((0.05, 0.0, 0.02))
     fine = [resample_by_arc_length(path, 20000) for path in paths]
     expected = [np.linalg.norm(path - point.position, axis=1).min() for path in fine]
-    np.testing.assert_allclose(closest_distances(point, motion), expected, atol=1e-4)
+    np.testing.assert_allclose(point.distances(motion), expected, atol=1e-4)
     for path, place, tangent in zip(paths, *closest_points(point, motion), strict=True):
         steps = np.diff(path, axis=0)
         lengths = np.linalg.norm(steps, axis=1)
@@ -232,7 +232,7 @@ def test_a_chosen_strength_is_taken_as_it_is():
     assert motion.at_least > 0.2
     built = point.build(motion)
     assert built.duration == 0.2 and built.goal is motion.goal and not built.hopeless
-    assert point.satisfied(motion)  # nobody asked for more
+    assert point.satisfied(motion, motion.positions)  # nobody asked for more
 
 
 # several

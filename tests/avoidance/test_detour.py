@@ -153,7 +153,7 @@ def test_settings_are_those_of_the_avoidance():
 
     def direction(**settings):
         (detour,) = HandAvoidance(oblique, detour=DetourSettings(**settings)).build(motion).detours
-        assert detour.direction is not None
+        assert detour is not None
         return detour.direction
 
     assert abs(direction(along=0.0)[0]) > 0.9 and abs(direction(along=50.0)[0]) < 0.4

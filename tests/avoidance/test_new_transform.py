@@ -10,20 +10,18 @@ from scenes import avoiding, changed, frame_at
 from twirl import shown_in_the_readme
 
 from dt_viz.avoidance import registry
-from dt_viz.scenario.stack import anchored, listed, shifted, surroundings, switched, tunable, with_added
+from dt_viz.scenario.stack import anchored, listed, shifted, switched, tunable, with_added
 from dt_viz.session.frame import Stage
 from dt_viz.ui.tabs.world import add_transform, add_transforms, addable
 
 
 @pytest.fixture(params=[("Twirl 1", "Avoidance"), ("Avoidance", "Twirl 1")], ids=" below ".join)
 def scenario(request, engine, initial, monkeypatch):
-    """The kind is looked up and added as the page does."""
-    monkeypatch.setattr(registry, "KINDS", (*registry.KINDS, shown_in_the_readme()))  # the one line
+    """The kind is added as the page does."""
+    kind, kinds = shown_in_the_readme()
+    monkeypatch.setattr(registry, "KINDS", kinds)  # the one line
     plain = initial("lift_box")
-    twirl = next(kind for kind in registry.KINDS if kind.title == "Twirl").beside(
-        surroundings(engine.task("lift_box"), plain)
-    )
-    stack, name = with_added(plain, twirl)
+    stack, name = with_added(plain, kind())
     scenario = replace(plain, stack=stack)
     if request.param[1] == name:
         scenario = replace(scenario, stack=shifted(scenario, name, 1))
@@ -58,7 +56,7 @@ def test_it_turns_motions_as_it_says_and_not_when_it_is_off(engine, scenario):
 
 
 def test_the_page_offers_it_and_has_its_controls(server, monkeypatch):
-    monkeypatch.setattr(registry, "KINDS", (*registry.KINDS, shown_in_the_readme()))
+    monkeypatch.setattr(registry, "KINDS", shown_in_the_readme()[1])
     bound = Bound(avoiding("lift_box"))
     session: Any = bound.edited
     add_transforms(server.gui, bound)

@@ -1,4 +1,4 @@
-"""Ways out of obstacles while these are dragged: remembered, kept for all motions at once, and turned gradually."""
+"""Ways out of obstacles while these are dragged: carried over, kept for all motions, and turned at a limited rate."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dt_viz.avoidance.detour import NEARBY, Detour, remembered
+from dt_viz.avoidance.detour import NEARBY, Detour, carried_over
 from dt_viz.avoidance.hand import HandAvoidance
 from dt_viz.avoidance.sideways import Encounter, fixing_ends
 from dt_viz.avoidance.transform import MotionBelow
@@ -45,14 +45,22 @@ def motion_past(*offsets, end=0.4):
     return MotionBelow(paths[:, 0], end * X + HEIGHT * Z, index, paths.reshape(-1, 3))
 
 
+def carried(detour, obstacle, **how):
+    """The detour as the next motion gets it, with its obstacle where it is now."""
+    (found,) = carried_over([replace(detour, kept=True)], [obstacle], **how)
+    assert found is not None
+    return found
+
+
 # --- turning ---
 
 
 @given(seeds, st.floats(0, 0.03))
 def test_a_way_turns_by_an_angle_for_each_metre_and_arrives(seed, travel):
     start, side, *across = some_directions(seed, 5)
-    before = Detour(ball(), start, start)
-    way = Detour(ball(travel, 0.0, 0.0), side, side, kept=True).turned_from(before, across, TURNING)
+    obstacle = ball(travel, 0.0, 0.0)
+    before = carried(Detour(ball(), start, start), obstacle)
+    way = Detour(obstacle, side, side, kept=True).turned_from(before, across, TURNING)
     assert np.linalg.norm(way.direction) == pytest.approx(1, abs=1e-12)
     assert angle(way.direction, start) <= TURNING * travel / RADIUS + 1e-6
     assert way.kept and way.side is side
@@ -60,15 +68,15 @@ def test_a_way_turns_by_an_angle_for_each_metre_and_arrives(seed, travel):
         if way.direction is side:
             break
         farther = ball(way.obstacle.position[0] + 0.005, 0.0, 0.0)
-        turned = Detour(farther, side, side).turned_from(way, across, TURNING)
+        turned = Detour(farther, side, side).turned_from(carried(way, farther), across, TURNING)
         assert angle(turned.direction, way.direction) <= TURNING * 0.005 / RADIUS + 1e-6
         way = turned
     assert way.direction is side
 
 
 def test_a_way_turns_to_the_opposite_over_what_is_across():
-    before, way = Detour(ball(), Z, Z), Detour(ball(0.0, 0.0, 0.005), -Z, -Z)
-    turned = way.turned_from(before, [Z, Y], TURNING)
+    obstacle = ball(0.0, 0.0, 0.005)
+    turned = Detour(obstacle, -Z, -Z).turned_from(carried(Detour(ball(), Z, Z), obstacle), [Z, Y], TURNING)
     assert turned.direction @ Y == pytest.approx(np.sin(TURNING * 0.005 / RADIUS))
 
 
@@ -83,10 +91,15 @@ def test_a_way_turns_to_the_opposite_over_what_is_across():
         (ball(), True, True),
     ],
 )
-def test_what_is_dragged_is_remembered(now, is_kept, known):
+@pytest.mark.parametrize("turn", [True, False])
+def test_what_is_dragged_is_carried_over(now, is_kept, known, turn):
     way = Detour(ball(), Z, Z, kept=is_kept)
-    assert remembered([way, None], [now, now]) == (way if known else None, None)
-    assert remembered([way], [now, now]) == (None, None)
+    found, none = carried_over([way, None], [now, now], turn=turn)
+    assert none is None and (found is not None) == known
+    if found is not None:
+        assert (found.obstacle, found.side is Z, found.direction is Z) == (ball(), True, True)
+        assert found.travelled == (now.position[2] - HEIGHT if turn else None)
+    assert carried_over([way], [now, now], turn=turn) == (None, None)
 
 
 # --- sides ---
@@ -111,11 +124,11 @@ def blocks(seed):
 
 
 def test_without_a_way_before_it_is_the_nearest_one_across_the_motions_and_in_their_plane():
-    way = passes_of(motion_past(0.02 * Z, 0.01 * Z)).detour(None, HAND, gradually=True)
+    way = passes_of(motion_past(0.02 * Z, 0.01 * Z)).detour(None, HAND)
     assert not way.kept
     assert way.direction @ Z > 0.9 and abs(way.direction @ X) < 0.1
     in_plane = passes_of(motion_past(0.001 * Z), plane=np.stack([X, Y], axis=1))
-    assert abs(in_plane.detour(None, HAND, gradually=False).direction @ Y) > 0.99
+    assert abs(in_plane.detour(None, HAND).direction @ Y) > 0.99
 
 
 @pytest.mark.parametrize("corner", [False, True])
@@ -126,7 +139,7 @@ def test_a_single_sample_is_led_out_however_far_out_it_is(corner):
     counts[np.abs(motion.positions[:, 0] - (0.045 if corner else 0.0)).argmin()] = True
     passes = Encounter.of(motion, counts, cube, 0.01)
     assert passes is not None
-    assert np.linalg.norm(passes.detour(None, HAND, gradually=False).direction) == pytest.approx(1)
+    assert np.linalg.norm(passes.detour(None, HAND).direction) == pytest.approx(1)
 
 
 def test_what_does_not_count_or_is_clear_does_not_pass():
@@ -144,7 +157,7 @@ def test_all_motions_are_carried_clear_on_one_side(seed):
     least = (0.009, -1e-3, 0.006)  # beside a box's corners, samples lack
     for obstacle, clearance in zip(blocks(seed), least, strict=True):
         passes = passes_of(motion, obstacle)
-        direction = passes.detour(None, HAND, gradually=False).direction
+        direction = passes.detour(None, HAND).direction
         flow = passes.flow(direction, 1e-9)
         moved = flow.inverse(motion.positions)
         assert obstacle.signed_distance(moved).min() > clearance
@@ -160,7 +173,7 @@ def test_no_motion_is_turned_sharply_however_near_to_the_middle_it_passes(seed):
     s = np.linspace(-0.4, 0.4, 801)
     for obstacle in blocks(seed):
         passes = passes_of(motion, obstacle)
-        flow = passes.flow(passes.detour(None, HAND, gradually=False).direction, 1e-9)
+        flow = passes.flow(passes.detour(None, HAND).direction, 1e-9)
         assert sharpest_turn(flow.inverse(np.outer(s, X) + motion.starts[0] * [0, 1, 1]), 0.015) < 25
 
 
@@ -176,9 +189,9 @@ def test_starts_and_goal_stay_where_they_are(seed):
 def test_the_way_out_does_not_end_in_an_obstacle_that_is_passed_already():
     beside = ball(0.0, 0.0, 0.1)
     motion = motion_past(0.02 * Z)
-    assert passes_of(motion).detour(None, HAND, gradually=False).direction @ Z > 0.9
+    assert passes_of(motion).detour(None, HAND).direction @ Z > 0.9
     passes = passes_of(motion, others=(beside,))
-    direction = passes.detour(None, HAND, gradually=False).direction
+    direction = passes.detour(None, HAND).direction
     assert direction @ Z < 0.5
     assert beside.signed_distance(passes.flow(Z, 1e-9).inverse(motion.positions)).min() > 0.007
 
@@ -190,7 +203,7 @@ def test_motions_keep_their_side_until_another_costs_much_less_then_turn_togethe
         obstacle = ball(0.0, 0.0, 0.001 * k)  # moved as a drag moves it; the motions are told relative to it
         passes = passes_of(motion_past((height + 0.002) * Z, (height - 0.002) * Z))
         moved = replace(passes, obstacle=obstacle, points=passes.points + 0.001 * k * Z)
-        way = moved.detour(way, HAND, gradually=True)
+        way = moved.detour(carried(way, obstacle), HAND)
         directions.append(way.direction)
         durations.append(passes.flow(way.direction, 1e-9).duration)
     beyond = np.array([direction @ Z for direction in directions])
@@ -204,21 +217,21 @@ def test_a_turn_that_would_lead_far_around_is_made_at_once():
     """What has come near on the other side makes the way before a long one."""
     before = Detour(ball(), Y, Y, kept=True, length=0.001)
     passes = passes_of(motion_past((RADIUS + 0.009) * Y, -(RADIUS + 0.009) * Y), ball(0.001, 0.0, 0.0))
-    way = passes.detour(before, HAND, gradually=True)
+    way = passes.detour(carried(before, passes.obstacle), HAND)
     assert abs(way.direction @ Z) > 0.8 and way.length < 0.03
 
 
 def test_a_side_is_held_where_what_is_stacked_on_it_moves_the_ends():
     motion = motion_past(0.01 * Y, end=RADIUS + 0.02)
-    aside = passes_of(motion).flow(Z, 1e-9)
+    flow = passes_of(motion).flow(Z, 1e-9)
     outer = AdaptiveFlow(ball().field("free-space", 6.0), 0.1, 1e-9)
     ends = np.concatenate([motion.starts, motion.goal[None]])
     moved = outer.forward(ends)
     assert np.linalg.norm(moved - ends, axis=1).min() > 1e-3
-    assert np.linalg.norm(aside.forward(moved) - moved, axis=1).max() > 1e-3
-    np.testing.assert_allclose(fixing_ends(aside, outer).forward(moved), moved, atol=1e-9)
+    assert np.linalg.norm(flow.forward(moved) - moved, axis=1).max() > 1e-3
+    np.testing.assert_allclose(fixing_ends(flow, outer).forward(moved), moved, atol=1e-9)
 
 
 def test_at_rest_the_way_is_on_its_side_at_once():
-    way = passes_of(motion_past(-0.03 * Z)).detour(Detour(ball(), Z, Z, kept=True), HAND, gradually=False)
+    way = passes_of(motion_past(-0.03 * Z)).detour(carried(Detour(ball(), Z, Z), ball(), turn=False), HAND)
     assert way.direction @ Z < -0.97

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scenes import avoiding, beside, biases, changed, frame_at
 
-from dt_viz.avoidance.bias import MAX_TARGET_MISS, PLACED_BESIDE, BiasPoint
-from dt_viz.avoidance.hand import Avoidance
-from dt_viz.avoidance.registry import KINDS
-from dt_viz.avoidance.transform import Choice, FlowIntegration, Number, Switch
+from dt_viz.avoidance.bias import MAX_TARGET_MISS, BiasPoint
+from dt_viz.avoidance.hand import Avoidance, HandAvoidance
+from dt_viz.avoidance.page import Choice, FlowIntegration, Number, Switch
+from dt_viz.avoidance.placement import PLACED_BESIDE, bias_beside
+from dt_viz.avoidance.registry import BIAS, KINDS
 from dt_viz.flows.diffeomorphisms import Integration
 from dt_viz.motion.stack import LIVE, build_stack
 from dt_viz.obstacles.shapes import Sphere
@@ -40,7 +41,7 @@ QUICK = ("draw_s", "draw_8", "push_box")
 """Tasks whose new bias points are followed in the quick tests, too."""
 PLACES = ((0.1, -0.5, 0.4), (0.2, -0.5, 0.4), (0.3, -0.5, 0.4))
 SPHERE = Sphere((0.0, -0.5, 0.4))
-AVOIDANCE = Avoidance.title
+AVOIDANCE = KINDS[HandAvoidance].title
 EULER = Integration("euler", 3)
 
 
@@ -168,13 +169,13 @@ def test_levels_have_the_names_of_what_the_engine_stacks(engine, changes, expect
 
 
 def placed_beside(task, scenario):
-    return BiasPoint.beside(surroundings(task, scenario))
+    return bias_beside(surroundings(task, scenario))
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_new_bias_points_lie_beside_the_motion_apart_from_each_other_and_in_the_plane_of_a_drawing(task, initial):
     task, scenario = TASKS[task](), initial(task)
-    for _ in range(BiasPoint.most):
+    for _ in range(BIAS.most):
         point = placed_beside(task, scenario)
         assert (point.plane is None) == (task.demonstrations[0].dimension == 3)
         nearest = min(np.linalg.norm(path - point.position, axis=1).min() for path in task.paths)
@@ -186,7 +187,7 @@ def test_new_bias_points_lie_beside_the_motion_apart_from_each_other_and_in_the_
             assert abs(np.cross(*plane) @ (np.asarray(point.position) - task.slice.centre)) < 1e-9
         assert point.position[2] > 0
         scenario = added(scenario, point)
-    assert len(anchored(scenario)) == BiasPoint.most
+    assert len(anchored(scenario)) == BIAS.most
 
 
 @pytest.mark.parametrize("task", [pytest.param(t, marks=[pytest.mark.slow] * (t not in QUICK)) for t in TASKS])
@@ -239,9 +240,10 @@ def test_what_is_set_is_what_is_read_and_the_others_stay(name):
 @pytest.mark.parametrize("kind", KINDS)
 def test_settings_are_of_fields_and_show_what_a_new_transform_has(kind, initial):
     """Only what is chosen automatically has no value yet."""
-    transform = kind.beside(surroundings(TASKS["draw_s"](), initial("draw_s")))
-    assert {setting.field for setting in transform.settings} <= {field.name for field in fields(transform)}
-    for setting in transform.settings:
+    entry = KINDS[kind]
+    transform = entry.added(surroundings(TASKS["draw_s"](), initial("draw_s"))) if entry.added else kind()
+    assert {setting.field for setting in entry.settings} <= {field.name for field in fields(transform)}
+    for setting in entry.settings:
         value = getattr(transform, setting.field)
         match setting:
             case Number():

@@ -187,7 +187,7 @@ def _scenario(task: Task, options: argparse.Namespace) -> Scenario:
 def _moved(scenario: Scenario, place: tuple[float, float, float]) -> dict[str, Any]:
     """Return the changed fields of the scenario after the drag to a place."""
     for name, point in anchored(scenario).items():
-        return {"stack": with_transform(scenario, name, point.anchored(place))}
+        return {"stack": with_transform(scenario, name, replace(point, position=place))}
     first, *others = scenario.avoidance.obstacles
     return {"stack": with_avoidance(scenario, obstacles=(first.moved(place), *others))}
 

@@ -7,8 +7,9 @@ from body_spheres import cover
 from laws.registry import OBSTACLES, TILTED
 
 from dt_viz.avoidance.arm import WholeArm
-from dt_viz.avoidance.arm_field import COMPLEX_STEP, WholeArmField
+from dt_viz.avoidance.arm_field import WholeArmField
 from dt_viz.flows.integrators import DORMAND_PRINCE, RK4, carried
+from dt_viz.kernels.proximity import COMPLEX_STEP
 from dt_viz.obstacles.shapes import as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.body_points import load_body_points

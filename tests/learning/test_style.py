@@ -10,6 +10,7 @@ from drawings import frechet, path_from
 from scenes import kinds
 
 from dt_viz.avoidance.hand import Avoidance
+from dt_viz.avoidance.registry import AVOIDANCE
 from dt_viz.flows.augmented_systems import Shear
 from dt_viz.learning.augmented import fit_augmented
 from dt_viz.learning.patterns import AugmentedSettings
@@ -103,7 +104,7 @@ def test_a_hand_of_several_patterns_is_no_style_and_it_fits_motions_of_as_many_c
 def test_around_a_sphere_every_certificate_holds(engine):
     task = engine.task("draw_c")
     sphere = Sphere(as_point(task.mean_path[40]), 0.08)
-    scenario = Scenario("draw_c", (Layer(Avoidance(sphere), name=Avoidance.title),), style="wavy", style_amount=1.5)
+    scenario = Scenario("draw_c", (Layer(Avoidance(sphere), name=AVOIDANCE.title),), style="wavy", style_amount=1.5)
     frame = list(engine.frames(scenario))[-1]
     known = frame.certificates
     assert kinds(known.warnings) <= {Kind.ARM_ENTERS} and known.lyapunov_falls is True

@@ -8,6 +8,7 @@ from scenes import avoiding, biases, changed, frame_at
 
 import dt_viz.session.engine
 from dt_viz.avoidance.bias import BiasPoint
+from dt_viz.avoidance.placement import bias_beside
 from dt_viz.metrics import distance_from_path, maximum_collision_distance
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.paper_scenes import SCENES
@@ -19,7 +20,7 @@ WARPS = (0.0, 0.15, 0.5, 0.85)
 
 
 def beside(task, scenario):
-    return BiasPoint.beside(surroundings(task, scenario))
+    return bias_beside(surroundings(task, scenario))
 
 
 def stacked(engine, task, **changes):

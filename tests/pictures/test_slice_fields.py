@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scenes import biases, changed, frame_at, tilted
 
-from dt_viz.avoidance.bias import BiasPoint
+from dt_viz.avoidance.placement import bias_beside
 from dt_viz.motion.stack import FINE, LIVE, build_stack, cut_off
 from dt_viz.pictures.slice_fields import MAX_OFFSET, SEPARATION
 from dt_viz.scenario.scenario import SLICE_COLOURS, View
@@ -31,7 +31,7 @@ def solved(engine, scenario, wanted=Stage.FINE):
 
 
 def with_bias(engine, scenario):
-    return changed(scenario, layers=biases(BiasPoint.beside(surroundings(engine.task(scenario.task), scenario))))
+    return changed(scenario, layers=biases(bias_beside(surroundings(engine.task(scenario.task), scenario))))
 
 
 @pytest.mark.parametrize("colour", ["det", "lyapunov", "occupancy"])

@@ -187,10 +187,13 @@ def test_where_the_spheres_clear_an_obstacle_the_meshes_clear_it_by_at_least_as_
     assert checked >= 10 and (found_out > checked / 4).all()
 
 
-def test_distances_end_where_they_are_enough(body, robot):
+def test_distances_are_cut_off_at_their_bounds(body, robot):
     q, ball = random_configurations(robot, 0, (50,)), Sphere((0.2, -0.3, 0.3), 0.1)
-    exact, enough = body.clearance(robot, q, ball), np.linspace(-0.05, 0.3, 50)
-    np.testing.assert_allclose(body.clearance(robot, q, ball, enough), np.minimum(exact, enough), rtol=0, atol=1e-12)
+    exact, highest = body.clearance(robot, q, ball), np.linspace(-0.05, 0.3, 50)
+    for lowest in (-np.inf, np.random.default_rng(0).permutation(highest) - 0.05, highest, 0.1):
+        bounded = np.maximum(highest, lowest)
+        found = body.clearance(robot, q, ball, bounded, lowest)
+        np.testing.assert_allclose(found, np.clip(exact, lowest, bounded), rtol=0, atol=1e-12)
     points = cover(body)
     expected = (ball.signed_distance(points.positions(robot, q)) - points.radius).min(axis=1)
     np.testing.assert_allclose(exact, expected, rtol=0, atol=1e-12)

@@ -167,9 +167,9 @@ def test_every_stroke_of_the_j_passes_both_points_within_a_centimetre(live):
     points = anchored(frame.scenario)
     assert len(points) == 2
     for point in points.values():
-        assert min(np.linalg.norm(path - point.anchor, axis=1).min() for path in frame.ghost) > 0.02
+        assert min(np.linalg.norm(path - point.position, axis=1).min() for path in frame.ghost) > 0.02
         for path in frame.rollouts:
-            assert np.linalg.norm(resample_by_arc_length(path, 2000) - point.anchor, axis=1).min() <= 0.0105
+            assert np.linalg.norm(resample_by_arc_length(path, 2000) - point.position, axis=1).min() <= 0.0105
     np.testing.assert_allclose(frame.reached, frame.goal, atol=1e-3)
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scenes import avoiding, biases, changed, random_scenario
 
-from dt_viz.avoidance.bias import BiasPoint
-from dt_viz.avoidance.hand import Avoidance
+from dt_viz.avoidance.placement import bias_beside
+from dt_viz.avoidance.registry import AVOIDANCE
 from dt_viz.flows.diffeomorphisms import AUTO, METHODS, AdaptiveFlow, Chain, Conjugated, Flow, Integration
 from dt_viz.flows.fields import GaussianGrid, GridRBF
 from dt_viz.flows.integrators import EULER, RK4
@@ -103,7 +103,7 @@ def test_euler_in_few_steps_is_warned_of_during_a_drag_and_certificates_agree(en
     scenario = changed(initial("draw_s"), **coarse)
     live, last = certified(engine, scenario)
     kinds = [Kind.FOLDS, Kind.INEXACT_INVERSE] if folds else [Kind.INEXACT_INVERSE]
-    expected = [(kind, Avoidance.title) for kind in kinds]
+    expected = [(kind, AVOIDANCE.title) for kind in kinds]
     assert (last.min_det_jacobian < 0) == folds
     assert last.round_trip_error > 1e-3
     if folds:
@@ -121,9 +121,9 @@ def test_a_fold_of_what_is_drawn_is_said_and_certified(engine):
     coarse = {"integration": Integration("euler", 1), "generator": "probability"}
     scenario = changed(random_scenario(engine, 300), **coarse)
     live, last = certified(engine, scenario)
-    assert of_kind(live, Kind.FOLDS) == [(Kind.FOLDS, Avoidance.title)]
+    assert of_kind(live, Kind.FOLDS) == [(Kind.FOLDS, AVOIDANCE.title)]
     assert last.min_det_jacobian < 0
-    assert of_kind(last, Kind.FOLDS, Kind.NO_DIFFEOMORPHISM) == [(Kind.FOLDS, Avoidance.title)]
+    assert of_kind(last, Kind.FOLDS, Kind.NO_DIFFEOMORPHISM) == [(Kind.FOLDS, AVOIDANCE.title)]
 
 
 def test_rk4_with_many_steps_of_a_mild_flow_is_as_good_as_auto(engine, initial):
@@ -139,7 +139,7 @@ def test_rk4_with_many_steps_of_a_mild_flow_is_as_good_as_auto(engine, initial):
 @pytest.mark.parametrize(("strength", "folds"), [(2.5, True), (0.1, False)])
 def test_a_bias_point_has_an_integrator_of_its_own(engine, strength, folds):
     plain = avoiding("draw_s")
-    point = replace(BiasPoint.beside(surroundings(engine.task("draw_s"), plain)), strength=strength)
+    point = replace(bias_beside(surroundings(engine.task("draw_s"), plain)), strength=strength)
     coarse = replace(point, integration=Integration("euler", 1))
     assert certified(engine, changed(plain, layers=biases(point)))[0].warnings == ()
     live, last = certified(engine, changed(plain, layers=biases(coarse)))

@@ -12,8 +12,8 @@ import pytest
 from scenes import avoiding, biases, changed, changing, starts_at
 
 from dt_viz.avoidance.bias import BiasPoint
-from dt_viz.avoidance.hand import Avoidance
 from dt_viz.avoidance.passing import ANEW, Passing
+from dt_viz.avoidance.registry import AVOIDANCE
 from dt_viz.errors import end_if, never
 from dt_viz.learning.demonstrations import DemonstrationError
 from dt_viz.learning.imitation import ImitationError
@@ -769,7 +769,7 @@ def test_a_level_that_is_gone_is_not_looked_at_when_another_gets_its_name(opened
     stack, _ = with_added(session.scenario, BiasPoint((0.2, -0.5, 0.4)))
     session.edit("add", stack=stack)
     session.end_gesture()
-    for level in (IMITATION, Avoidance.title, "Bias 1"):
+    for level in (IMITATION, AVOIDANCE.title, "Bias 1"):
         session.edit("see", view=View(level=level))
         assert session.scenario.view.level == level
     if back == "undo":

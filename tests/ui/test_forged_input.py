@@ -16,6 +16,7 @@ from viser import _messages as messages  # noqa: TID251
 from dt_viz.avoidance.detour import DetourSettings
 from dt_viz.scenario.paper_scenes import offered
 from dt_viz.scenario.scenario import View
+from dt_viz.scenario.stack import anchored
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui import controls, gestures
 from dt_viz.ui.panel import LANE
@@ -208,7 +209,7 @@ def test_only_gizmos_that_are_shown_can_be_moved_and_those_can(page):
 
 DRAGGED = {
     "/obstacles/0/surface": lambda scenario: scenario.obstacles[0].position,
-    "/bias/0/ball": lambda scenario: next(filter(None, (layer.transform.anchor for layer in scenario.stack))),
+    "/bias/0/ball": lambda scenario: next(iter(anchored(scenario).values())).position,
     "/starts/1": lambda scenario: scenario.starts[1].place,
 }
 """Where things stand, by the name of what is dragged in the scene."""

@@ -52,7 +52,7 @@ def test_rollouts_pass_where_the_handles_of_a_bias_point_are_dragged_to(page, en
     target = engine.task("draw_s").mean_path[50] + 0.05 * AREA.axes[:, 0]
     page.move("/bias/0", tuple(target))
     (layer,) = beside(page.session.scenario)
-    np.testing.assert_allclose(layer.transform.anchor, target)
+    np.testing.assert_allclose(layer.transform.position, target)
     for path in frame_at(engine, page.session.scenario, Stage.ROLLOUTS).rollouts:
         assert np.linalg.norm(path - target, axis=1).min() < 0.01
 

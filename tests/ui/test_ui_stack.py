@@ -10,6 +10,7 @@ from pages import Bound, Edited, frame_of, ignored
 from scenes import avoiding, beside, biases, changed
 
 from dt_viz.avoidance.bias import BiasPoint
+from dt_viz.avoidance.registry import BIAS
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.panels import BASE_PANEL
 from dt_viz.scenario.scenario import Scenario, View
@@ -191,10 +192,10 @@ def test_bias_points_stand_where_they_are_and_the_one_that_was_clicked_has_handl
 
 def test_bias_points_are_added_changed_and_deleted():
     session: Any = Edited(changed(SCENARIO, layers=()))
-    for _ in range(BiasPoint.most + 1):
+    for _ in range(BIAS.most + 1):
         add_transform(session, BiasPoint)
     points = anchored(session.scenario)
-    assert len(points) == BiasPoint.most
+    assert len(points) == BIAS.most
     assert selected(session.scenario) == list(points)[-1]
     session.edit("select", view=View(bias="Bias 2"))
     delete_transform(session)

@@ -6,17 +6,18 @@ Then a ring is around the region that it acts in. In a drawing the handles move 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 import viser
 import viser.transforms
 
-from dt_viz.avoidance.transform import Transform, axes_of
+from dt_viz.avoidance.transform import Anchored, axes_of
 from dt_viz.flows.fields import Array
 from dt_viz.obstacles.shapes import as_point
 from dt_viz.scenario.scenario import Scenario
-from dt_viz.scenario.stack import anchored, selected, transform_of, with_transform
+from dt_viz.scenario.stack import anchored, selected, with_transform
 from dt_viz.session.frame import Frame
 from dt_viz.session.session import Session
 from dt_viz.ui.scene.markers import Marker, MarkerGroup
@@ -45,16 +46,15 @@ class BiasMarker(Marker):
         self._label = add_label(scene, f"{node}/label", anchor="top-left")
         super().__init__(group, gizmo, self.ball, scale=0.11)
 
-    def adopt(self, name: str, transform: Transform, *, on: bool, handles: bool) -> None:
+    def adopt(self, name: str, transform: Anchored, *, on: bool, handles: bool) -> None:
         """Move to the transform's place, unless the browser has moved there already."""
-        assert transform.anchor is not None
-        plane = transform.anchor_plane
-        self.stand(transform.anchor, viser.transforms.SO3.from_matrix(axes_of(plane)).wxyz)
+        plane = transform.plane
+        self.stand(transform.position, viser.transforms.SO3.from_matrix(axes_of(plane)).wxyz)
         flat = plane is not None
         self.node.active_axes = (True, True, not flat)
         self.region.points = _rings(flat=flat)
         self.key = name
-        self._label.text = f"{name.lower()}: goal" if transform.ends_motions else name.lower()
+        self._label.text = f"{name.lower()}: goal" if transform.moves_goal else name.lower()
         self.ball.color = LIGHT.bias if on else LIGHT.stale
         self.region.colors = np.array(LIGHT.region if on else LIGHT.stale, dtype=np.uint8)
         self.has_handles = handles
@@ -100,7 +100,7 @@ class BiasPoints(MarkerGroup[BiasMarker]):
         on = {layer.name for layer in scenario.stack if layer.on}
         for marker, (name, transform) in zip(self.items, transforms.items(), strict=True):
             marker.adopt(name, transform, on=name in on, handles=name == handled)
-        self._regions = {name: transform.region for name, transform in transforms.items()}
+        self._regions = {name: transform.radius for name, transform in transforms.items()}
         self._show_regions()
 
     def _show_regions(self) -> None:
@@ -116,6 +116,6 @@ class BiasPoints(MarkerGroup[BiasMarker]):
 
     def _move(self, session: Session, marker: BiasMarker, position: Array, wxyz: Array) -> None:
         name, scenario = str(marker.key), session.scenario
-        transform = transform_of(scenario, name)
+        transform = anchored(scenario).get(name)
         if transform is not None:  # or it was deleted a moment ago
-            session.edit(name, stack=with_transform(scenario, name, transform.anchored(as_point(position))))
+            session.edit(name, stack=with_transform(scenario, name, replace(transform, position=as_point(position))))

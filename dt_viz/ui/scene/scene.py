@@ -56,7 +56,7 @@ class Goal(Picture):
         elsewhere = bool(np.linalg.norm(frame.reached - frame.goal) > MAX_GOAL_MISS)
         self.label.text = OLD_GOAL if elsewhere else GOAL
         # the marker of a transform that moves the goal says so
-        goals = [to.anchor for to in anchored(frame.scenario).values() if to.anchor is not None and to.ends_motions]
+        goals = [to.position for to in anchored(frame.scenario).values() if to.moves_goal]
         marked = any(np.linalg.norm(frame.reached - goal) < STYLES.bias.radius for goal in goals)
         self._end.visible = elsewhere and not marked
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import Any
 
 import viser
 
 from dt_viz.avoidance import registry
-from dt_viz.avoidance.transform import Choice, FlowIntegration, Number, Setting, Switch, Transform
+from dt_viz.avoidance.page import Choice, FlowIntegration, Number, PageEntry, Setting, Switch
+from dt_viz.avoidance.transform import Transform
 from dt_viz.flows.diffeomorphisms import MAX_STEPS, Method
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import WHOLE_ARM, transform_of, with_transform
@@ -19,7 +20,7 @@ from dt_viz.ui.controls import Control
 
 Chosen = Callable[[Scenario], str | None]
 """Function that returns the name of the layer whose settings are shown; None where there is none."""
-Offered = Callable[[type[Transform]], Iterable[Setting]]
+Offered = Callable[[PageEntry], Iterable[Setting]]
 """Function that returns the settings of a kind that are shown."""
 
 
@@ -35,11 +36,11 @@ def add_settings(
         chosen: transform whose settings they are.
         order: order of all of them in the folder.
     """
-    for setting in dict.fromkeys(setting for kind in registry.KINDS for setting in offered(kind)):
+    for setting in dict.fromkeys(setting for entry in registry.KINDS.values() for setting in offered(entry)):
         _SettingField(gui, bindings, offered, chosen, setting).add({"order": order, "visible": False})
 
 
-def settings_of_purpose(kind: type[Transform]) -> tuple[Setting, ...]:
+def settings_of_purpose(kind: PageEntry) -> tuple[Setting, ...]:
     """Return the settings of a kind that are about what it is for, not about its flow."""
     return tuple(
         setting
@@ -70,7 +71,7 @@ class _SettingField:
         """Return the chosen transform; None if it has no such setting."""
         name = self.chosen(scenario)
         transform = None if name is None else transform_of(scenario, name)
-        return transform if transform is not None and self.setting in self.offered(type(transform)) else None
+        return transform if transform and self.setting in self.offered(registry.entry_of(transform)) else None
 
     def read(self, of_value: Callable[[Any], Any], otherwise: Any) -> Callable[[Scenario], Any]:  # noqa: ANN401
         """Return a function of a scenario: `of_value` of the field, or `otherwise` where there is none."""
@@ -102,7 +103,7 @@ class _SettingField:
             if name is None or transform is None:
                 return {}
             changed = {self.setting.field: meant(getattr(transform, self.setting.field), value)}
-            return {"stack": with_transform(scenario, name, replace(cast(Any, transform), **changed))}
+            return {"stack": with_transform(scenario, name, replace(transform, **changed))}
 
         self.bindings.properties(handle, visible=self.read(visible, otherwise=False))
         return self.bindings.input(handle, self.read(shown, otherwise=KEEP), change)

@@ -9,9 +9,11 @@ from typing import Any
 
 import viser
 
+from dt_viz.avoidance.avoidance import Avoidance
 from dt_viz.avoidance.bias import BiasPoint
-from dt_viz.avoidance.hand import Avoidance
-from dt_viz.avoidance.transform import Setting, Transform
+from dt_viz.avoidance.page import PageEntry, Setting
+from dt_viz.avoidance.registry import AVOIDANCE, entry_of
+from dt_viz.avoidance.transform import Transform
 from dt_viz.learning.imitation import OBJECTIVES
 from dt_viz.learning.state import STATES
 from dt_viz.scenario.panels import BASE_PANEL
@@ -119,7 +121,7 @@ def rows(scenario: Scenario, durations: Mapping[str, float | None]) -> tuple[Sta
         moves = (UP,) * (k < len(order) - 1) + (DOWN,) * (k > 0)
         look = (_look(scenario, name),) * (name in seen)
         transform = transform_of(scenario, name)
-        label = _label(name, durations.get(name), "t" if transform is None else transform.flow_time)
+        label = _label(name, durations.get(name), "t" if transform is None else entry_of(transform).flow_time)
         rows.append(StackRow(name, label, (ON if name in on else OFF, *moves, *look)))
     place = place_of(scenario, WHOLE_ARM)
     if WHOLE_ARM in tunable(scenario) and place is not None:
@@ -170,7 +172,7 @@ def formula_html(scenario: Scenario) -> str:
 def _index(name: str) -> str:
     """Return the index of a transform's ψ: o for the avoidance of obstacles, or else its initial and number."""
     word, _, number = name.partition(" ")
-    return "o" if name == Avoidance.title else html.escape(word[:1].lower() + number)
+    return "o" if name == AVOIDANCE.title else html.escape(word[:1].lower() + number)
 
 
 def _part(index: str, colour: Colour) -> str:
@@ -269,7 +271,7 @@ def _is_imitation(scenario: Scenario) -> bool:
     return tuned(scenario) == IMITATION
 
 
-def _settings(kind: type[Transform]) -> tuple[Setting, ...]:
+def _settings(kind: PageEntry) -> tuple[Setting, ...]:
     """Return the settings of a kind in the stack: those of its flow; all of one that is not added on the page."""
     others = () if kind.most == 1 else settings_of_purpose(kind)
     return tuple(setting for setting in kind.settings if setting not in others)

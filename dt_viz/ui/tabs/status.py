@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 
 import viser
 
+from dt_viz.avoidance.registry import entry_of
 from dt_viz.robot.collision import SELF_REACH, CollisionReport
 from dt_viz.scenario.paper_scenes import SCENES
 from dt_viz.scenario.scenario import View
@@ -160,7 +161,7 @@ def _duration_rows(frame: Frame, off: str) -> tuple[tuple[str, str], ...]:
     for layer, duration in zip(frame.scenario.stack, frame.durations, strict=False):
         if duration is None:
             continue
-        if layer.transform.most == 1:
+        if entry_of(layer.transform).most == 1:
             hand = duration
         else:
             strengths.append(f"{duration:.2f} {layer.name}")

@@ -208,7 +208,8 @@ def add_transforms(gui: viser.GuiApi, bindings: Bindings) -> None:
     """Build the folder "Transforms": adds and deletes transforms, and changes the selected one."""
     kinds = addable()
     with gui.add_folder("Transforms"):
-        hints = "; ".join(f"{title}: {kind.hint}" for title, kind in kinds.items() if kind.hint)
+        hinted = ((title, registry.KINDS[kind].hint) for title, kind in kinds.items())
+        hints = "; ".join(f"{title}: {hint}" for title, hint in hinted if hint)
         buttons = gui.add_button_group("Add", tuple(kinds), hint=hints)
         bindings.properties(buttons, options=lambda s: _offered(s) or KEEP, visible=lambda s: bool(_offered(s)))
         bindings.later(buttons, lambda session, title: add_transform(session, kinds[title]))
@@ -224,14 +225,15 @@ def add_transforms(gui: viser.GuiApi, bindings: Bindings) -> None:
         )
         handles = bindings.checkbox(gui, "bias_handles", visible=False).handle
         bindings.properties(handles, visible=lambda s: bool(added(s)))
-        add_settings(gui, bindings, lambda kind: settings_of_purpose(kind) if kind.most > 1 else (), selected)
+        add_settings(gui, bindings, lambda entry: settings_of_purpose(entry) if entry.most > 1 else (), selected)
 
 
 def add_transform(session: Session, kind: type[Transform]) -> None:
     """Add a transform of a kind beside the middle of the motion, and select it."""
-    scenario = session.scenario
-    if kind.title in _offered(scenario):
-        stack, name = with_added(scenario, kind.beside(surroundings(session.task, scenario)))
+    scenario, entry = session.scenario, registry.KINDS[kind]
+    if entry.title in _offered(scenario):
+        transform = entry.added(surroundings(session.task, scenario)) if entry.added else kind()
+        stack, name = with_added(scenario, transform)
         session.step("add", stack=stack, view=replace(scenario.view, bias=name))
 
 
@@ -244,13 +246,13 @@ def delete_transform(session: Session) -> None:
 
 def addable() -> dict[str, type[Transform]]:
     """Return the kinds of transforms that are added, by the name of their button."""
-    return {kind.title: kind for kind in registry.KINDS if kind.most > 1}
+    return {entry.title: kind for kind, entry in registry.KINDS.items() if entry.most > 1}
 
 
 def _offered(scenario: Scenario) -> tuple[str, ...]:
     """Return the titles of the kinds of which there may be one more."""
-    present = [type(transform).title for transform in added(scenario).values()]
-    return tuple(title for title, kind in addable().items() if present.count(title) < kind.most)
+    present = [registry.entry_of(transform).title for transform in added(scenario).values()]
+    return tuple(title for title, kind in addable().items() if present.count(title) < registry.KINDS[kind].most)
 
 
 def add_starts(gui: viser.GuiApi, bindings: Bindings) -> None:
