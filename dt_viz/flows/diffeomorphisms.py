@@ -257,7 +257,7 @@ MAX_STEPS, MOST_STEPS = 50, 1000
 """Largest numbers of steps of a flow: on the page, and at all."""
 
 
-_Flow = TypeVar("_Flow", Flow, AdaptiveFlow)
+_Flow = TypeVar("_Flow", bound=Flow | AdaptiveFlow)
 
 
 @dataclass(frozen=True)
