@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from dt_viz.learning.demonstrations import Demonstration
 
 def save_demonstrations(path: Path, demonstrations: Sequence[Demonstration]) -> None:
     """Write demonstrations as npz: ``times_i``, ``positions_i`` and ``name_i`` for i = 0, 1, …."""
-    arrays = {
+    arrays: dict[str, Any] = {
         f"{field}_{i}": np.asarray(getattr(demonstration, field))
         for i, demonstration in enumerate(demonstrations)
         for field in ("times", "positions", "name")
