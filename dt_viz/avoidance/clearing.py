@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from dt_viz.flows.diffeomorphisms import Flow
 from dt_viz.flows.fields import Array, VectorField
-from dt_viz.flows.integrators import integrate, rk4
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.union import Union
 
@@ -38,7 +38,7 @@ def clearing_duration(
         if duration >= longest:
             return None
         before = lacking[left]
-        points, _ = integrate(rk4, field, points[left], None, -step, 1)
+        points = Flow(field, step, 1).inverse(points[left])
         lacking = lack(points)
         part = 1.0 if (lacking > 0).any() else float((before / np.maximum(before - lacking, 1e-12)).clip(0, 1).max())
         duration += part * step

@@ -17,7 +17,6 @@ from dt_viz.avoidance.start_status import start_warnings
 from dt_viz.avoidance.transform import Built, MotionBelow, Planar, SidewaysFlow, axes_of
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain, Diffeomorphism
 from dt_viz.flows.fields import Array, Mask, Projected, VectorField
-from dt_viz.flows.integrators import integrate_adaptive
 from dt_viz.obstacles.shapes import Obstacle, Point
 from dt_viz.obstacles.union import Union
 from dt_viz.warning import Kind, MotionWarning, in_millimetres
@@ -104,7 +103,7 @@ class HandAvoidance(Avoidance, Planar, space="task"):
         if duration is None:
             points, margin = motion.positions[self._avoidable(motion)], self._kept_margin(motion)
             if at_least > 0:
-                points, _ = integrate_adaptive(field, points, None, -at_least, TOLERANCE)
+                points = AdaptiveFlow(field, at_least, TOLERANCE).inverse(points)
             more = clearing_duration(
                 field, points, lambda s: margin - obstacle.signed_distance(s), SNAPSHOT, MAX_DURATION - at_least
             )
@@ -113,7 +112,7 @@ class HandAvoidance(Avoidance, Planar, space="task"):
             hopeless = duration is None or (self.integration.by_hand and 0 < duration <= at_least)
             if duration is None:
                 duration = MAX_DURATION
-                carried, _ = integrate_adaptive(field, points, None, -duration, TOLERANCE)
+                carried = AdaptiveFlow(field, duration, TOLERANCE).inverse(points)
                 if obstacle.signed_distance(carried).min() < 0:
                     flat = self.generator == "probability"
                     why = "∇p is flat inside it" if flat else "it runs through its dead centre"

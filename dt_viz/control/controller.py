@@ -353,7 +353,7 @@ class ArmController:
         if activity.rollout is None:
             state = base.states(hand)
         else:
-            state = base.states_like(hand, images[activity.rollout % len(images)])
+            state = base.states(hand, like=images[activity.rollout % len(images)])
         if activity.rest is not None and len(activity.rest) == len(state) - 3:
             state = base.caught(np.concatenate([hand, activity.rest]), stack.stacked.forward(hand))
         return towards(stack.system, self._section, q, state, self.settings, z)

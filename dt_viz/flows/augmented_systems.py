@@ -182,12 +182,10 @@ class PhasedAttractor(Attractor):
     power: float = 3.0
     """p: with a large one, what leads off the motion fades early."""
 
-    def states(self, places: Array, label: float | None = None) -> Array:
-        return self.predictions.states(places, label)
-
-    def states_like(self, places: Array, image: Array) -> Array:
-        states, label = self.states(places), slice(2 * self.predictions.dim + 1, None)
-        states[..., label] = image[label]  # ψ leaves phase and condition as they are
+    def states(self, places: Array, label: float | None = None, like: Array | None = None) -> Array:
+        states, end = self.predictions.states(places, label), 2 * self.predictions.dim + 1
+        if like is not None:
+            states[..., end:] = like[end:]  # ψ leaves phase and condition as they are
         return states
 
     def demonstrated(self, starts: Array) -> Array:
@@ -298,9 +296,9 @@ class Frozen(Attractor):
             np.concatenate([z, np.broadcast_to(self.rest, (*z.shape[:-1], len(self.rest)))], -1)
         )
 
-    def potential_at(self, distance: float) -> float:
-        """At a distance from where the whole system's motions end, at this phase."""
-        return self.moving.potential_at(float(np.hypot(distance, self.rest[0])))
+    def potential_at(self, distance: Array | float) -> Array:
+        """At distances (*B,) from where the whole system's motions end, at this phase."""
+        return self.moving.potential_at(np.hypot(distance, self.rest[0]))
 
     def velocity(self, z: Array) -> Array:
         """Compute ẋ (*B, d), m/s."""

@@ -6,15 +6,15 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, overload
+from typing import Literal, TypeVar
 
 import numpy as np
 
 from dt_viz.errors import check_between
 from dt_viz.flows.fields import Array, VectorField
-from dt_viz.flows.integrators import Step, euler, integrate, integrate_adaptive, rk4
+from dt_viz.flows.integrators import DORMAND_PRINCE, EULER, RK4, carried
 
 
 class Diffeomorphism(ABC):
@@ -88,9 +88,10 @@ class Flow(Diffeomorphism):
     field: VectorField
     duration: float = 1.0
     steps: int = 8
-    step: Step = rk4
-    inverse_step: Step | None = None
-    """Integrator for ψ⁻¹; None takes `step`. `implicit_euler` with `euler` gives an inverse exact to rounding."""
+    method: int = RK4
+    """Method of `dt_viz.flows.integrators`."""
+    inverse_method: int | None = None
+    """Method for ψ⁻¹; None takes `method`. `IMPLICIT_EULER` with `EULER` gives an inverse exact to rounding."""
 
     @property
     def dim(self) -> int:
@@ -105,19 +106,15 @@ class Flow(Diffeomorphism):
 
         Where it is not positive, the step folds space: the numerical map is no diffeomorphism, though the flow is one.
         """
-        step = (self.inverse_step or self.step) if inverse else self.step
-        h = (-self.duration if inverse else self.duration) / self.steps
-        smallest, identity = np.inf, _identity_like(s)
+        step, smallest = replace(self, duration=self.duration / self.steps, steps=1), np.inf
         for _ in range(self.steps):
-            s, J = step(self.field, s, identity, h)
-            assert J is not None
+            s, J = step.inverse_jacobian(s) if inverse else step.jacobian(s)
             smallest = min(smallest, float(np.linalg.det(J).min(initial=np.inf)))
         return smallest
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
-        if inverse:
-            return integrate(self.inverse_step or self.step, self.field, s, U, -self.duration, self.steps)
-        return integrate(self.step, self.field, s, U, self.duration, self.steps)
+        method = self.method if self.inverse_method is None or not inverse else self.inverse_method
+        return carried(self.field, s, U, method, -self.duration if inverse else self.duration, self.steps)
 
 
 @dataclass(frozen=True)
@@ -141,7 +138,8 @@ class AdaptiveFlow(Diffeomorphism):
         return replace(self, duration=fraction * self.duration)
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
-        return integrate_adaptive(self.field, s, U, -self.duration if inverse else self.duration, self.tolerance)
+        duration = -self.duration if inverse else self.duration
+        return carried(self.field, s, U, DORMAND_PRINCE, duration, MOST_STEPS, self.tolerance)
 
 
 @dataclass(frozen=True, init=False)
@@ -167,23 +165,6 @@ class Chain(Diffeomorphism):
         for part in self.parts if inverse else reversed(self.parts):
             s, U = part._map(s, U, inverse=inverse)
         return s, U
-
-
-@dataclass(frozen=True)
-class Inverse(Diffeomorphism):
-    """ψ⁻¹ as a diffeomorphism of its own."""
-
-    of: Diffeomorphism
-
-    @property
-    def dim(self) -> int:
-        return self.of.dim
-
-    def scaled(self, fraction: float) -> Inverse:
-        return Inverse(self.of.scaled(fraction))
-
-    def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
-        return self.of._map(s, U, inverse=not inverse)
 
 
 @dataclass(frozen=True)
@@ -272,9 +253,11 @@ class Placed(Diffeomorphism):
 Method = Literal["auto", "rk4", "euler"]
 """`auto` keeps the result exact to a tolerance; the others take equal steps, Euler's being the paper's."""
 METHODS: tuple[Method, ...] = ("auto", "rk4", "euler")
-STEPS: Mapping[Method, Step] = {"rk4": rk4, "euler": euler}
 MAX_STEPS, MOST_STEPS = 50, 1000
 """Largest numbers of steps of a flow: on the page, and at all."""
+
+
+_Flow = TypeVar("_Flow", bound=Flow | AdaptiveFlow)
 
 
 @dataclass(frozen=True)
@@ -292,17 +275,11 @@ class Integration:
         """Whether the user chose the steps, so that no tolerance is guaranteed."""
         return self.method != "auto"
 
-    @overload
-    def of(self, flow: Flow) -> Flow: ...
-
-    @overload
-    def of(self, flow: AdaptiveFlow) -> Flow | AdaptiveFlow: ...
-
-    def of(self, flow: Flow | AdaptiveFlow) -> Flow | AdaptiveFlow:
+    def of(self, flow: _Flow) -> _Flow | Flow:
         """The flow integrated by this method; `auto` leaves `flow` as it is."""
         if self.method == "auto":
             return flow
-        return Flow(flow.field, flow.duration, self.steps, STEPS[self.method])
+        return Flow(flow.field, flow.duration, self.steps, RK4 if self.method == "rk4" else EULER)
 
     def __str__(self) -> str:
         """Name on the page, such as "Euler in 3 steps"."""

@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dt_viz.kernels.dormand_prince import RATE
+from dt_viz.kernels.dormand_prince import RATE, RK4
 from dt_viz.kernels.fields import GRID, TERM, Terms
 from dt_viz.kernels.flows import carry
 from dt_viz.numerics import Array, Indices, Mask  # noqa: F401 - other packages import them with the fields
@@ -42,7 +42,13 @@ class CompiledField(ABC):
 
     @abstractmethod
     def dormand_prince(self, s: Array, duration: float, tolerance: float, max_steps: int) -> Array:
-        """Carry the points `s` (N, d) along as `integrate_adaptive` does. Raises ArithmeticError as it does."""
+        """Carry the points `s` (N, d) along in adaptive steps. Raises ArithmeticError where they are too many."""
+
+    def carried(self, s: Array, method: int, duration: float, steps: int, tolerance: float) -> Array:
+        """Carry the points `s` (N, d) along by one of these methods; see `dt_viz.flows.integrators.carried`."""
+        if method == RK4:
+            return self.rk4(s, duration, steps)
+        return self.dormand_prince(s, duration, tolerance, steps)
 
 
 class PointField(ABC):
@@ -75,11 +81,7 @@ class PointField(ABC):
     def carried(
         self, s: Array, U: Array | None, method: int, duration: float = 0.0, steps: int = 1, tolerance: float = 0.0
     ) -> tuple[Array, Array | None]:
-        """Carry `s` (N, d) and `U` (N, d, k) along the flow; see `dt_viz.kernels.flows.carry`.
-
-        Raises:
-            ArithmeticError: if some point needs more adaptive steps than `steps`.
-        """
+        """Carry `s` (N, d) and `U` (N, d, k) along the flow; see `dt_viz.flows.integrators.carried`."""
         num, d = s.shape
         states = np.empty((num, d if U is None else d * (1 + U.shape[2])))
         states[:, :d] = s
@@ -182,10 +184,6 @@ class GaussianGrid:
         for factor in self.factors(s):
             columns = (columns[:, :, None] * factor[0][:, None, :]).reshape(len(s), -1)
         return columns
-
-    def gram(self) -> Array:
-        """Kernel matrix K (m, m) of the inducing points, whose form WᵀKW is the RKHS norm of a field."""
-        return self.features(self.inducing_points)
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,6 @@
-"""One step of an integrator, for a state and, where asked for, for tangents carried along with it.
+"""Flows of vector fields by a numerical method, with tangents carried along where asked for.
 
-A step takes (field, s, U, h): points `s` (N, d), tangents `U` (N, d, k) or None, step length h of either sign. It
-returns the new points and tangents. Tangents obey the variational equation U̇ = DV·U, integrated by the same method,
-so they are the exact derivative of the numerical step.
+Tangents obey the variational equation U̇ = DV·U, so that they are the derivative of the flow.
 """
 
 from __future__ import annotations
@@ -10,150 +8,98 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from scipy.integrate import RK45
 
 from dt_viz.flows.fields import Array, CompiledField, PointField, VectorField
-from dt_viz.kernels.dormand_prince import (
-    DORMAND_PRINCE,
-    ERROR,
-    EULER,
-    RK4,
-    ROUNDING,
-    SHORT,
-    STAGES,
-    TANGENT_TOLERANCE,
-    first_step,
-)
+from dt_viz.kernels.dormand_prince import DORMAND_PRINCE, EULER, RK4
 from dt_viz.kernels.flows import IMPLICIT_EULER
+from dt_viz.numerics import divisor
 
-Step = Callable[[VectorField, Array, "Array | None", float], "tuple[Array, Array | None]"]
+__all__ = ["DORMAND_PRINCE", "EULER", "IMPLICIT_EULER", "RK4", "carried"]
 
-
-def euler(field: VectorField, s: Array, U: Array | None, h: float) -> tuple[Array, Array | None]:
-    """Explicit Euler, the paper's: s + h·V(s). First order."""
-    state, rate = _augment(field, s, U)
-    return _split(state + h * rate(state), s, U)
-
-
-def rk4(field: VectorField, s: Array, U: Array | None, h: float) -> tuple[Array, Array | None]:
-    """The classical Runge–Kutta step. Fourth order."""
-    state, rate = _augment(field, s, U)
-    k1 = rate(state)
-    k2 = rate(state + h / 2 * k1)
-    k3 = rate(state + h / 2 * k2)
-    k4 = rate(state + h * k3)
-    return _split(state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4), s, U)
+DIFFERENCE = 1e-3
+"""Distance of the points by whose flows tangents are found, in their unit: next to what the core of a field measures,
+their flows are straight, and errors of 1e-7 change a slope by some 1e-4."""
 
 
-def implicit_euler(field: VectorField, s: Array, U: Array | None, h: float) -> tuple[Array, Array | None]:
-    """Implicit Euler, of compiled fields: the y with y − h·V(y) = s. First order, and the exact inverse of `euler`.
-
-    Newton's method, point by point going back half the way where the residual has grown. While I − h·DV is regular
-    everywhere, which is also when the step is invertible, that leads to the one solution from everywhere.
-    """
-    assert isinstance(field, PointField)
-    return field.carried(s, U, IMPLICIT_EULER, h)
-
-
-def integrate(
-    step: Step, field: VectorField, s: Array, U: Array | None, duration: float, steps: int
+def carried(
+    field: VectorField,
+    s: Array,
+    U: Array | None,
+    method: int,
+    duration: float,
+    steps: int = 1,
+    tolerance: float = 0.0,
 ) -> tuple[Array, Array | None]:
-    """Carry `s` (N, d) and `U` (N, d, k) along the flow of `field` for `duration` in equal `steps`.
+    """Carry points `s` (N, d) and tangents `U` (N, d, k) along the flow of a field.
 
-    Compiled fields have loops of their own for the steps of this module.
-    """
-    if isinstance(field, PointField) and step in METHODS:
-        return field.carried(s, U, METHODS[step], duration, steps)
-    if U is None and step is rk4 and isinstance(field, CompiledField):
-        return field.rk4(s, duration, steps), None
-    h = duration / steps
-    for _ in range(steps):
-        s, U = step(field, s, U, h)
-    return s, U
+    Compiled fields have loops of their own. Of others, tangents are carried by the differences, of fourth order, of
+    points beside `s`.
 
-
-def integrate_adaptive(
-    field: VectorField, s: Array, U: Array | None, duration: float, tolerance: float, *, max_rounds: int = 1000
-) -> tuple[Array, Array | None]:
-    """Carry `s` (N, d) and `U` (N, d, k) along the flow of `field` with the Dormand–Prince 5(4) pair.
-
-    Every point has its own step length. The estimated error of a step is at most `tolerance` (in the unit of `s`) for
-    the points, less in proportion where the motion is shorter than `SHORT`, and at most `TANGENT_TOLERANCE` for the
-    tangents. The first step is short where the field changes quickly along it, because the estimated error of a step
-    that is far too long may be small by chance.
+    Args:
+        field: V.
+        s: points.
+        U: tangents, or None.
+        method: `EULER`, the paper's, of first order; `RK4`, of fourth; `IMPLICIT_EULER`, of first, the exact inverse of
+            Euler's, for a `PointField` only; or `DORMAND_PRINCE`, adaptive steps of each point by itself.
+        duration: of the flow, of either sign.
+        steps: number of equal steps, or largest number of adaptive ones.
+        tolerance: largest estimated error of an adaptive step, in the unit of `s`; smaller in proportion where the
+            motion is short. That of tangents is `dt_viz.kernels.dormand_prince.TANGENT_TOLERANCE`.
 
     Raises:
-        ArithmeticError: if some point needs more than `max_rounds` steps.
+        ArithmeticError: some point needs more adaptive steps than `steps`.
     """
-    if duration == 0 or not len(s):
-        return s, U
     if isinstance(field, PointField):
-        return field.carried(s, U, DORMAND_PRINCE, duration, max_rounds, tolerance)
-    if U is None and isinstance(field, CompiledField):
-        return field.dormand_prince(s, duration, tolerance, max_rounds), None
-    total, sign, d = abs(duration), np.sign(duration), s.shape[1]
-    state, rate = _augment(field, s, U)
-    result, first = state.copy(), rate(state)
-    # of each point that has not arrived: its row, state, rate, time left, and length of the next step
-    active = np.flatnonzero(first.any(axis=1))
-    start, first, left = state[active], first[active], np.full(len(active), total)
-    # how quickly velocities change is seen at the end of an Euler step, no longer than the tolerance
-    speed = np.abs(first[:, :d]).max(axis=1, initial=0).clip(ROUNDING)
-    ahead = np.minimum(total, tolerance / speed)
-    there = field(start[:, :d] + sign * ahead[:, None] * first[:, :d])
-    turning = np.abs(there - first[:, :d]).max(axis=1, initial=0) / (ahead * speed)
-    h = np.array([first_step(v, w, total, tolerance) for v, w in zip(speed, turning, strict=True)])
-    for _ in range(max_rounds):
-        if not len(active):
-            return _split(result, s, U)
-        step, end = sign * h[:, None], start
-        stages = np.empty((len(STAGES), *start.shape))
-        stages[0] = first
-        for i, row in enumerate(STAGES[1:], start=1):
-            # the last stage point is the fifth-order result: first same as last
-            end = start + step * _combined(row[:i], stages[:i])
-            stages[i] = rate(end)
-        defect = step * _combined(ERROR, stages)
-        # beside a rest point a small error is large relative to the motion, and grows with it
-        motion = np.abs(end - start)[:, :d].max(axis=1)
-        error = np.abs(defect[:, :d]).max(axis=1) / (tolerance / SHORT * motion).clip(ROUNDING, tolerance)
-        if U is not None:
-            largest = np.maximum(np.abs(end[:, d:]).max(axis=1), np.finfo(float).tiny)
-            error = np.maximum(error, np.abs(defect[:, d:]).max(axis=1) / (TANGENT_TOLERANCE * largest))
-        accepted = error <= 1
-        start = np.where(accepted[:, None], end, start)
-        first = np.where(accepted[:, None], stages[-1], first)
-        left = left - accepted * h
-        h = np.minimum(h * np.clip(0.9 * np.maximum(error, 1e-10) ** -0.2, 0.1, 5.0), left)
-        going = left > total * 1e-12
-        result[active[~going]] = start[~going]
-        active, start, first, left, h = (values[going] for values in (active, start, first, left, h))
-    raise ArithmeticError(f"{len(active)} points need more than {max_rounds} steps: the field is too steep for them")
+        return field.carried(s, U, method, duration, steps, tolerance)
+    if U is not None:
+        return _by_differences(lambda points: carried(field, points, None, method, duration, steps, tolerance)[0], s, U)
+    if isinstance(field, CompiledField) and method != EULER:
+        return field.carried(s, method, duration, steps, tolerance), None
+    if method == DORMAND_PRINCE:
+        return _adaptively(field, s, duration, steps, tolerance), None
+    return _stepped(field, s, method, duration, steps), None
 
 
-METHODS: dict[Step, int] = {euler: EULER, rk4: RK4, implicit_euler: IMPLICIT_EULER}
-"""Steps of which compiled fields have loops."""
+def _by_differences(flow: Callable[[Array], Array], s: Array, U: Array) -> tuple[Array, Array]:
+    """Images (N, d) of points `s` (N, d) and of tangents `U` (N, d, k) by the images of points beside them."""
+    num, d, k = U.shape
+    lengths = np.linalg.norm(U, axis=1, keepdims=True)
+    steps = DIFFERENCE * np.swapaxes(U / divisor(lengths), 1, 2)
+    shifted = s[:, None, None] + np.array([1, -1, 2, -2])[:, None, None] * steps[:, None]  # (N, 4, k, d)
+    images = flow(np.concatenate([s, shifted.reshape(-1, d)]))
+    near, before, far, behind = np.moveaxis(images[num:].reshape(num, 4, k, d), 1, 0)
+    slopes = (8 * (near - before) - (far - behind)) / (12 * DIFFERENCE)
+    return images[:num], lengths * np.swapaxes(slopes, 1, 2)
 
 
-def _combined(coefficients: Array, stages: Array) -> Array:
-    """Weighted sum (N, ·) of stages (S, N, ·), as one product."""
-    return (coefficients @ stages.reshape(len(stages), -1)).reshape(stages.shape[1:])
+def _stepped(field: VectorField, s: Array, method: int, duration: float, steps: int) -> Array:
+    """Carry points (N, d) along in equal explicit steps."""
+    h = duration / steps
+    for _ in range(steps):
+        k = field(s)
+        if method == RK4:
+            second = field(s + h / 2 * k)
+            third = field(s + h / 2 * second)
+            k = (k + 2 * second + 2 * third + field(s + h * third)) / 6
+        s = s + h * k
+    return s
 
 
-def _augment(field: VectorField, s: Array, U: Array | None) -> tuple[Array, Callable[[Array], Array]]:
-    """Join points and tangents to one state (N, d·(1+k)); also returns the function that gives its rate of change."""
-    if U is None:
-        return s, field
-    _, d, k = U.shape
-
-    def rate(state: Array) -> Array:
-        v, DV = field.with_jacobian(state[:, :d])
-        return np.concatenate([v, (DV @ state[:, d:].reshape(-1, d, k)).reshape(len(v), d * k)], axis=1)
-
-    return np.concatenate([s, U.reshape(len(s), d * k)], axis=1), rate
-
-
-def _split(state: Array, s: Array, U: Array | None) -> tuple[Array, Array | None]:
-    if U is None:
-        return state, None
-    d = s.shape[1]
-    return state[:, :d], state[:, d:].reshape(U.shape)
+def _adaptively(field: VectorField, s: Array, duration: float, max_steps: int, tolerance: float) -> Array:
+    """Carry points (N, d) along in adaptive steps that are as long for all of them."""
+    solver = RK45(
+        lambda _time, state: field(state.reshape(s.shape)).reshape(-1),
+        0.0,
+        s.reshape(-1),
+        duration,
+        rtol=100 * np.finfo(float).eps,  # the smallest that is accepted
+        atol=tolerance / np.sqrt(max(s.size, 1)),  # of the root mean square, so that none is more off
+    )
+    for _ in range(max_steps):
+        solver.step()
+        if solver.status == "finished":
+            return solver.y.reshape(s.shape)
+        if solver.status == "failed":
+            break
+    raise ArithmeticError(f"some of {len(s)} points need more than {max_steps} steps: the field is too steep for them")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,24 +32,20 @@ class Attractor:
         """Dimension d of the space."""
         return len(self.goal)
 
-    def states(self, places: Array, label: float | None = None) -> Array:
+    def states(self, places: Array, label: float | None = None, like: Array | None = None) -> Array:
         """The states (*B, d) in which motions from places (*B, d) begin: the places themselves.
+
+        Args:
+            places: metres.
+            label: of the motions, in a system that tells them apart by labels.
+            like: (d,) where in base space a motion is whose label these have, instead.
 
         Raises:
             FormatError: no demonstration has such a label.
         """
         if label is not None:
             raise FormatError("label", f"{label!r}", "none, in the plain state")
-        return places
-
-    def states_like(self, places: Array, image: Array) -> Array:
-        """The states (*B, d) in which motions from places (*B, d) begin that have the label of another motion.
-
-        Args:
-            places: metres.
-            image: (d,) where the other motion is in base space.
-        """
-        del image
+        del like
         return places
 
     def demonstrated(self, starts: Array) -> Array:
@@ -71,13 +66,10 @@ class Attractor:
 
     def potential(self, z: Array) -> Array:
         """Φ(z), (*B,): zero at the goal, growing away from it, falling along every motion."""
-        return self._potential(self.distance(z))
+        return self.potential_at(self.distance(z))
 
-    def potential_at(self, distance: float) -> float:
-        """Φ at a distance from the goal, metres."""
-        return float(self._potential(np.array(distance)))
-
-    def _potential(self, distance: Array) -> Array:
+    def potential_at(self, distance: Array | float) -> Array:
+        """Φ at distances (*B,) from the goal, metres."""
         ratio = distance / self.smoothing
         log_cosh = ratio + np.log1p(np.exp(-2 * ratio)) - np.log(2)
         return self.speed * self.smoothing * log_cosh
@@ -145,43 +137,6 @@ class DiffeomorphicSystem:
     def rollout(self, y0: Array, times: Array) -> Array:
         """y(t) = ψ⁻¹(z(t)), (*B, T, d), from `y0` (*B, d) at `times` (T,) or (*B, T): exact, all at once."""
         return self.transform.inverse(self.base.flow(self.transform.forward(y0), times))
-
-    def stepped_rollout(self, y0: Array, times: Array, substeps: int = 1) -> Array:
-        """The same motion by stepping ẏ = J⁻¹ f(ψ(y)) with RK4: the independent oracle for `rollout`.
-
-        Args:
-            y0: (*B, d) starts.
-            times: (T,) increasing, seconds; the first is the start's.
-            substeps: RK4 steps between neighbouring times.
-
-        Returns:
-            (*B, T, d) positions.
-        """
-        return stepped(self.velocity, y0, times, substeps)
-
-
-def stepped(velocity: Callable[[Array], Array], y0: Array, times: Array, substeps: int) -> Array:
-    """Integrate ẏ = velocity(y) with RK4.
-
-    Args:
-        velocity: takes states (*B, d).
-        y0: (*B, d) starts.
-        times: (T,) increasing, seconds; the first is the start's.
-        substeps: number of RK4 steps between neighbouring times.
-
-    Returns:
-        (*B, T, d) states.
-    """
-    y, motion = y0, [y0]
-    for h in np.diff(times) / substeps:
-        for _ in range(substeps):
-            k1 = velocity(y)
-            k2 = velocity(y + h / 2 * k1)
-            k3 = velocity(y + h / 2 * k2)
-            k4 = velocity(y + h * k3)
-            y = y + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        motion.append(y)
-    return np.stack(motion, axis=-2)
 
 
 def log_sinh(a: Array) -> Array:

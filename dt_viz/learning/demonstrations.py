@@ -35,7 +35,6 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import scipy.io
@@ -235,29 +234,6 @@ def read_demonstrations(content: bytes, source: str | Path, *, rate: float | Non
     with parsing(DemonstrationError, source, "file", accepted):
         demonstrations, lines = read(content, source, rate)
     return check_demonstrations(demonstrations, source, lines)
-
-
-def save_demonstrations(path: str | Path, demonstrations: Sequence[Demonstration]) -> None:
-    """Write demonstrations as npz: ``times_i``, ``positions_i`` and ``name_i`` for i = 0, 1, ….
-
-    Args:
-        path: the file to write, ending in ``.npz``; an existing one is replaced.
-        demonstrations: what to write; :func:`load_demonstrations` gives back equal times, positions and names.
-
-    Raises:
-        DemonstrationError: the suffix is another one, or :func:`check_demonstrations` refuses the demonstrations.
-        OSError: the file cannot be written.
-    """
-    path = Path(path)
-    if path.suffix.lower() != ".npz":
-        raise DemonstrationError(path, "suffix", repr(path.suffix), ".npz")
-    arrays: dict[str, Any] = {}
-    for i, demonstration in enumerate(check_demonstrations(demonstrations, path)):
-        arrays[f"times_{i}"] = demonstration.times
-        arrays[f"positions_{i}"] = demonstration.positions
-        arrays[f"name_{i}"] = np.array(demonstration.name)
-    with path.open("wb") as file:
-        np.savez_compressed(file, **arrays)
 
 
 def lasa_files(folder: str | Path) -> dict[str, Path]:

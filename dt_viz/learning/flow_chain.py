@@ -18,7 +18,7 @@ from scipy.spatial import KDTree
 
 from dt_viz.flows.diffeomorphisms import Chain, Flow
 from dt_viz.flows.fields import Array, GaussianGrid, GridRBF
-from dt_viz.flows.integrators import euler, implicit_euler
+from dt_viz.flows.integrators import EULER, IMPLICIT_EULER
 
 JITTER = 1e-4  # diagonal added to the kernel matrix, since overlapping Gaussians are nearly dependent
 ROUNDING = 1e-9  # part of a distance by which inducing points on the edge of the reach, as in even data, count as near
@@ -176,7 +176,7 @@ class FlowChain:
         for layer, theta in zip(self.layers, thetas, strict=True):
             field = layer.field(theta)
             reversed_field = GridRBF(field.grid, -field.weights)
-            flows.append(Flow(scaled_field(reversed_field, centre, scale), 1.0, self.steps, implicit_euler, euler))
+            flows.append(Flow(scaled_field(reversed_field, centre, scale), 1.0, self.steps, IMPLICIT_EULER, EULER))
         return Chain(flows)
 
 

@@ -22,7 +22,7 @@ from dt_viz.flows.diffeomorphisms import (
     round_trip_error,
 )
 from dt_viz.flows.fields import Array, GaussianGrid, GridRBF
-from dt_viz.flows.integrators import euler, implicit_euler
+from dt_viz.flows.integrators import EULER, IMPLICIT_EULER
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.demonstrations import DIMENSIONS, Demonstration
 from dt_viz.learning.flow_chain import FlowChain, FlowLayer, equally_spaced_grid, scaled_field
@@ -138,7 +138,9 @@ class Imitation(AnyImitation):
         for index, flow in enumerate(self.transform.parts):
             assert isinstance(flow, Flow) and isinstance(flow.field, GridRBF)
             arrays[f"layer_{index}_weights"] = flow.field.weights
-            arrays[f"layer_{index}_ell_steps_forward"] = np.array([flow.field.grid.ell, flow.steps, flow.step is euler])
+            arrays[f"layer_{index}_ell_steps_forward"] = np.array(
+                [flow.field.grid.ell, flow.steps, flow.method == EULER]
+            )
             for axis, coordinates in enumerate(flow.field.grid.axes):
                 arrays[f"layer_{index}_axis_{axis}"] = coordinates
         return arrays
@@ -161,7 +163,7 @@ class Imitation(AnyImitation):
                 found = f"ℓ = {ell:g} and {steps:g} steps"
                 raise FormatError(f"{prefix}ell_steps_forward", found, f"ℓ above 0 and 1 to {MOST_STEPS} steps")
             field = GridRBF(grid, _finite(arrays, f"{prefix}weights", grid.num_points, d))
-            integrators = (euler, implicit_euler) if forward else (implicit_euler, euler)
+            integrators = (EULER, IMPLICIT_EULER) if forward else (IMPLICIT_EULER, EULER)
             flows.append(Flow(field, 1.0, int(steps), *integrators))
         if d not in DIMENSIONS or not flows:
             raise FormatError("imitation", f"{d} coordinates and {len(flows)} layers", "2 or 3 coordinates, layers")
@@ -345,7 +347,7 @@ def _fit_velocities(motions: Motions, settings: ImitationSettings, progress: Pro
         min_determinant=settings.min_determinant,
     )
     field = scaled_field(GridRBF(grid, problem.solve(max_iterations, report)), centre, scale)
-    return Chain([Flow(field, 1.0, steps, euler, implicit_euler)])
+    return Chain([Flow(field, 1.0, steps, EULER, IMPLICIT_EULER)])
 
 
 def _width(motions: Motions, settings: ImitationSettings) -> float:

@@ -130,7 +130,7 @@ def prepare(demonstrations: Sequence[Demonstration], settings: PreparationSettin
     spread = _spread(list(usable.values()))
     usable, goal = _with_common_goal(usable, spread, settings, warnings)
 
-    numbers, names, times, positions = [], [], [], []
+    kept: dict[int, Demonstration] = {}
     for number, demonstration in usable.items():
         t, path = demonstration.times, _end_moved(demonstration.positions, goal)
         away = np.flatnonzero(np.linalg.norm(path - goal, axis=1) > settings.at_goal * spread)
@@ -146,13 +146,11 @@ def prepare(demonstrations: Sequence[Demonstration], settings: PreparationSettin
             t, path = t[first:] - t[first], path[first:]
         if standing := _stands_still(demonstration.name, t, path, spread, settings):
             warnings.append(standing)
-        numbers.append(number)
-        names.append(demonstration.name)
-        times.append(t)
-        positions.append(path)
-    if not positions:
+        kept[number] = Demonstration(t, path, demonstration.name)
+    if not kept:
         raise ImitationError("every demonstration starts at the goal and stays there; there is nothing to learn")
-    return Motions(tuple(numbers), tuple(names), tuple(times), tuple(positions), goal, spread, tuple(warnings))
+    names, times, positions = zip(*((one.name, one.times, one.positions) for one in kept.values()), strict=True)
+    return Motions(tuple(kept), names, times, positions, goal, spread, tuple(warnings))
 
 
 def _spread(demonstrations: Sequence[Demonstration]) -> float:

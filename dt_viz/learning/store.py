@@ -80,7 +80,8 @@ class FitStore:
             ImitationError: as `dt_viz.learning.imitation.fit`.
         """
         settings = settings or ImitationSettings()
-        key, progress = _content_key(demonstrations, settings), progress or (lambda _fraction, _message: None)
+        key = fingerprint(demonstrations, f"{FORMAT} {settings!r}")
+        progress = progress or (lambda _fraction, _message: None)
         if key in self._memory:
             return self._memory[key]
 
@@ -104,10 +105,9 @@ class FitStore:
     ) -> Imitation:
         imitation = fit(demonstrations, settings, progress)
         if self._folder is not None:
-            path = self._folder / f"{key}.npz"
             try:
                 self._folder.mkdir(parents=True, exist_ok=True)
-                write_whole(path, npz_bytes(imitation.to_arrays()))
+                write_whole(self._folder / f"{key}.npz", npz_bytes(imitation.to_arrays()))
             except OSError as error:
                 logger.warning("the fit was not cached: %s", error)
         return imitation
@@ -129,10 +129,6 @@ def _remove_leftovers(folder: Path) -> None:
         with suppress(OSError):  # another server may be faster
             if time.time() - path.stat().st_mtime > LONGEST_WRITE:
                 path.unlink()
-
-
-def _content_key(demonstrations: tuple[Demonstration, ...], settings: ImitationSettings) -> str:
-    return fingerprint(demonstrations, f"{FORMAT} {settings!r}")
 
 
 def fingerprint(demonstrations: tuple[Demonstration, ...], purpose: str) -> str:

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.integrate import cumulative_trapezoid
+from scipy.interpolate import make_interp_spline
 from scipy.optimize import lsq_linear
 
 from dt_viz.flows.diffeomorphisms import Diffeomorphism
-from dt_viz.flows.fields import Array
+from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.systems import Attractor, asinh_exp, log_sinh
 from dt_viz.learning.preparation import Motions
 from dt_viz.metrics import interpolate
@@ -62,8 +62,8 @@ class TimedAttractor(Attractor):
         """Compute ż, (*B, d), m/s."""
         offset = z - self.goal
         clock = self._clock(np.linalg.norm(offset, axis=-1))
-        pace = _interpolate_rows(self._position(clock), self._blended(offset))
-        return super().velocity(z) / pace[..., None]
+        _, inside, first, second = self._segment(clock[..., None], self._blended(offset))
+        return super().velocity(z) / (first + inside / self._spacing * (second - first))
 
     def flow(self, z0: Array, times: Array) -> Array:
         """Compute z(t), (*B, T, d), from `z0` (*B, d) at `times` (T,) or (*B, T), seconds, in closed form."""
@@ -107,9 +107,15 @@ class TimedAttractor(Attractor):
     def _spacing(self) -> float:
         return float(self.knots[1] - self.knots[0])
 
-    def _position(self, clock: Array) -> Array:
-        """Return the place of τ among the knots, from 0 at the first to K − 1 at the last."""
-        return np.clip((clock - self.knots[0]) / self._spacing, 0.0, len(self.knots) - 1)
+    def _segment(self, clock: Array, table: Array) -> tuple[Indices, Array, Array, Array]:
+        """Find the knot before τ (*B, N), how far τ is beyond it, and a `table` (*B, K) at that knot and the next.
+
+        What is beyond the knots counts as at the nearest.
+        """
+        position = np.clip((clock - self.knots[0]) / self._spacing, 0.0, len(self.knots) - 1)
+        index = np.minimum(position.astype(int), len(self.knots) - 2)
+        first, second = (np.take_along_axis(table, index + k, axis=-1) for k in (0, 1))
+        return index, (position - index) * self._spacing, first, second
 
     def _blended(self, offset: Array) -> Array:
         """Blend the paces m at the knots, (*B, K), for the rays through the points goal + `offset` (*B, d)."""
@@ -129,20 +135,23 @@ class TimedAttractor(Attractor):
 
     def _time_to_go(self, clock: Array, paces: Array) -> Array:
         """Compute T(τ), (*B, N), zero at the first knot, for `clock` (*B, N) on rays with `paces` (*B, K)."""
-        at_knots = _cumulative(paces, self._spacing)
-        position = self._position(clock)
-        index = np.minimum(position.astype(int), len(self.knots) - 2)
-        inside = (position - index) * self._spacing
-        start, first, second = (_take(a, index) for a in (at_knots, paces[..., :-1], paces[..., 1:]))
+        index, inside, first, second = self._segment(clock, paces)
+        start = np.take_along_axis(self._to_knots(paces), index, axis=-1)
         value = start + inside * (first + (second - first) * inside / (2 * self._spacing))
         beyond = np.maximum(clock - self.knots[-1], 0) * paces[..., -1:]
         return value + beyond + np.minimum(clock - self.knots[0], 0) * paces[..., :1]
 
+    def _to_knots(self, paces: Array) -> Array:
+        """Compute T (*B, K) at the knots."""
+        return cumulative_trapezoid(paces, dx=self._spacing, initial=0)
+
     def _clock_at(self, togo: Array, paces: Array) -> Array:
         """Invert `_time_to_go`: compute τ (*B, N) at times to go (*B, N)."""
-        at_knots = _cumulative(paces, self._spacing)
+        at_knots = self._to_knots(paces)
         index = np.clip((togo[..., None] >= at_knots[..., None, :]).sum(axis=-1) - 1, 0, len(self.knots) - 2)
-        start, first, second = (_take(a, index) for a in (at_knots, paces[..., :-1], paces[..., 1:]))
+        start, first, second = (
+            np.take_along_axis(a, index, axis=-1) for a in (at_knots, paces[..., :-1], paces[..., 1:])
+        )
         rest = np.clip(togo, 0, at_knots[..., -1:]) - start
         slope = (second - first) / self._spacing
         inside = 2 * rest / (first + np.sqrt(np.maximum(first**2 + 2 * slope * rest, 0)))
@@ -173,7 +182,7 @@ def learn_timing(transform: Diffeomorphism, motions: Motions, settings: TimingSe
     knots = np.linspace(nearest, farthest + 3 * (farthest - nearest) / (num_knots - 4), num_knots)
     paces = np.stack(
         [
-            _fit_pace(knots, clock[match], at, _speeds(at, sample), settings)
+            _fit_pace(knots, clock[match], at, np.linalg.norm(np.gradient(sample, at, axis=0), axis=1), settings)
             for clock, match, at, sample in zip(clocks, matched, stamps, samples, strict=True)
         ]
     )
@@ -214,8 +223,8 @@ def _fit_pace(knots: Array, clock: Array, elapsed: Array, speed: Array, settings
     small, which decides where there are no data.
     """
     spacing = knots[1] - knots[0]
-    rows = _hat_integrals((clock - knots[0]) / spacing, len(knots)) * spacing
-    rows = rows[0] - rows
+    passed = make_interp_spline(knots, np.eye(len(knots)), k=1).antiderivative()(clock)
+    rows = passed[0] - passed
     weight = (speed / speed.mean() + 0.05)[:, None]
     smooth = np.diff(np.eye(len(knots)), n=2, axis=0) * settings.smoothness * elapsed[-1]
     A = np.concatenate([weight * rows, smooth])
@@ -224,34 +233,3 @@ def _fit_pace(knots: Array, clock: Array, elapsed: Array, speed: Array, settings
     # A demonstration starts from rest. Motions that come from farther away must not be that slow all the way.
     beyond = np.clip(2 * (knots - clock[0]) / spacing - 1.5, 0, 1)
     return (1 - beyond) * pace + beyond * elapsed[-1] / (clock[0] - clock[-1])
-
-
-def _hat_integrals(position: Array, num: int) -> Array:
-    """Integrate the piecewise linear hat functions at 0, 1, …, num − 1 from 0 to each `position` (N,), as (N, num)."""
-    offset = position[:, None] - np.arange(num)
-    rising = np.clip(offset + 1, 0, 1)
-    falling = np.clip(offset, 0, 1)
-    integral = 0.5 * rising**2 + falling - 0.5 * falling**2
-    return integral - np.where(np.arange(num) == 0, 0.5, 0.0)
-
-
-def _speeds(times: Array, path: Array) -> Array:
-    return np.linalg.norm(np.gradient(path, times, axis=0), axis=1)
-
-
-def _cumulative(paces: Array, spacing: float) -> Array:
-    """Integrate `paces` (*B, K) by trapezoids, (*B, K), from zero at the first knot."""
-    areas = 0.5 * spacing * (paces[..., 1:] + paces[..., :-1])
-    return np.concatenate([np.zeros_like(paces[..., :1]), np.cumsum(areas, axis=-1)], axis=-1)
-
-
-def _take(table: Array, index: NDArray[np.integer[Any]]) -> Array:
-    """Take table[index], (*B, N), row by row of `table` (*B, K) at `index` (*B, N)."""
-    return np.take_along_axis(table, index, axis=-1)
-
-
-def _interpolate_rows(position: Array, table: Array) -> Array:
-    """Interpolate linearly, (*B,), in the rows of `table` (*B, K) at `position` (*B,) from 0 to K − 1."""
-    index = np.minimum(position.astype(int), table.shape[-1] - 2)[..., None]
-    first, second = _take(table, index)[..., 0], _take(table, index + 1)[..., 0]
-    return first + (position - index[..., 0]) * (second - first)

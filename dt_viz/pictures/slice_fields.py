@@ -170,7 +170,7 @@ def lyapunov_value(samples: Samples) -> ColourPicture:
     """Compute Φ(ψ(y)), which falls along every motion, and level lines: images of evenly spaced circles."""
     base, spacing = samples.system.base, LEVEL_SPACING
     values = base.potential(samples.images)
-    highest, levels = values.max(initial=0.0), (base.potential_at(spacing * k) for k in itertools.count(1))
+    highest, levels = values.max(initial=0.0), (float(base.potential_at(spacing * k)) for k in itertools.count(1))
     below = itertools.takewhile(lambda level: level < highest, levels)
     lines = samples.level_lines(values, below, base.speed * spacing)  # at most one in a cell
     return ColourPicture("lyapunov", samples.area, samples.spread(values), samples.clearance, lines)

@@ -11,7 +11,7 @@ from scenes import avoiding
 from dt_viz.avoidance.clearing import clearing_duration
 from dt_viz.avoidance.hand import ACCEPTED_MARGIN, MAX_DURATION, SNAPSHOT, HandAvoidance
 from dt_viz.avoidance.transform import MotionBelow
-from dt_viz.flows.integrators import integrate_adaptive
+from dt_viz.flows.diffeomorphisms import AdaptiveFlow
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.warning import Kind, MotionWarning
 
@@ -34,7 +34,7 @@ def clearing(field, sphere, points, margin=MARGIN):
 
 
 def carried(field, points, duration):
-    return integrate_adaptive(field, points, None, -duration, 1e-9)[0]
+    return AdaptiveFlow(field, duration, 1e-9).inverse(points)
 
 
 @given(seeds, st.sampled_from([1.0, 6.0, 20.0]))

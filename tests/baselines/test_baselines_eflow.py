@@ -2,14 +2,13 @@
 
 import numpy as np
 import pytest
-from oracles import central_differences
+from oracles import central_differences, stepped
 from plans import eflow_weights as weights
 
 from dt_viz.baselines.base import NotFittedError
 from dt_viz.baselines.eflow import EFlow, EFlowSystem
 from dt_viz.evaluate.held_out import frechet
 from dt_viz.flows.diffeomorphisms import round_trip_error
-from dt_viz.flows.systems import stepped
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.shipped import ASSETS
 

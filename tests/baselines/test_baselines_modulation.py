@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from oracles import stepped
 
 from dt_viz.baselines.base import NotFittedError
 from dt_viz.baselines.modulation import Modulation, ModulationSettings, modulated
 from dt_viz.baselines.registry import problem_of
-from dt_viz.flows.systems import stepped
 from dt_viz.metrics import distance_from_path
 from dt_viz.obstacles.shapes import Box, Cylinder, Sphere, as_point
 from dt_viz.obstacles.union import Union

@@ -44,7 +44,7 @@ from dt_viz.evaluate.options import (
 )
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain
 from dt_viz.flows.fields import Array
-from dt_viz.flows.integrators import integrate_adaptive
+from dt_viz.flows.integrators import DORMAND_PRINCE, carried
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
 from dt_viz.motion.nominal import Learned
 from dt_viz.motion.stack import FINE, build_stack
@@ -53,6 +53,7 @@ from dt_viz.obstacles.shapes import CloudObstacle, Point, Sphere, as_point
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.stack import plane_of
 from dt_viz.scenario.tasks import Task
+from tests.oracles import stepped as in_steps
 
 NUM_ROLLOUTS, NUM_POINTS = 8, 200
 FINER = 1e-4
@@ -171,7 +172,7 @@ def compare(systems: Systems, starts: Array, accuracy: float, repeats: int) -> d
         for t in 10 * tolerances
     }
     fixed = {
-        f"RK4, {2**k} steps a point": lambda n=2**k: systems(accuracy / 10).stepped_rollout(starts, times, n)
+        f"RK4, {2**k} steps a point": lambda n=2**k: in_steps(systems(accuracy / 10).velocity, starts, times, n)
         for k in range(7)
     }
     by_dop853 = cheapest(adaptive)
@@ -294,7 +295,7 @@ def stepped_beside(system: DiffeomorphicSystem, starts: Array, durations: Array)
     fractions = np.arange(1, 6) / 5
     state, places = np.concatenate([starts, durations[:, None]], axis=1), []
     for _ in fractions:
-        state, _ = integrate_adaptive(_Clocked(system), state, None, 1 / 5, STEP_TOLERANCE)
+        state, _ = carried(_Clocked(system), state, None, DORMAND_PRINCE, 1 / 5, 1000, STEP_TOLERANCE)
         places.append(state[:, :-1])
     stepped = np.stack(places, axis=1)
     exact = system.rollout(starts, durations[:, None] * fractions)

@@ -1,4 +1,4 @@
-"""Integrators by their order of convergence, and tangents as the derivative of the numerical step."""
+"""Methods by their order of convergence, and tangents as the derivative of the numerical step."""
 
 import numpy as np
 import pytest
@@ -8,18 +8,24 @@ from laws.registry import bent
 from oracles import central_differences
 from scipy.integrate import solve_ivp
 
-from dt_viz.flows.integrators import euler, implicit_euler, integrate, integrate_adaptive, rk4
+from dt_viz.flows.fields import GaussianGrid, GridRBF
+from dt_viz.flows.integrators import DORMAND_PRINCE, EULER, IMPLICIT_EULER, RK4, carried
 from dt_viz.obstacles.shapes import Sphere
 
 seeds = st.integers(0, 2**32 - 1)
-STEPS = [euler, implicit_euler, rk4]
+STEPS = [EULER, IMPLICIT_EULER, RK4]
 
 
-def tangents(flow, *arguments):
+def tangents(*arguments):
     """Only the tangents of a result, which are there where tangents were given."""
-    _, V = flow(*arguments)
+    _, V = carried(*arguments)
     assert V is not None
     return V
+
+
+def adaptively(field, s, duration, tolerance, steps=1000):
+    """Only the points, carried along in adaptive steps."""
+    return carried(field, s, None, DORMAND_PRINCE, duration, steps, tolerance)[0]
 
 
 def exact(field, s, duration):
@@ -29,13 +35,13 @@ def exact(field, s, duration):
     return np.stack([solve_ivp(velocity, (0, duration), point, **finest).y[:, -1] for point in s])
 
 
-@pytest.mark.parametrize(("step", "order"), [(euler, 1), (implicit_euler, 1), (rk4, 4)])
+@pytest.mark.parametrize(("step", "order"), [(EULER, 1), (IMPLICIT_EULER, 1), (RK4, 4)])
 def test_points_and_tangents_converge_with_the_order_of_the_step(step, order):
     rng = np.random.default_rng(5)
     field, s, counts = bent(2, 5, 0.5), rng.uniform(-1, 1, (6, 2)), [32, 64, 128]
     U = np.broadcast_to(np.eye(2), (6, 2, 2))
-    references = exact(field, s, 1.0), tangents(integrate, rk4, field, s, U, 1.0, 1000)
-    found = [integrate(step, field, s, U, 1.0, num) for num in counts]
+    references = exact(field, s, 1.0), tangents(field, s, U, RK4, 1.0, 1000)
+    found = [carried(field, s, U, step, 1.0, num) for num in counts]
     for values, reference in zip(zip(*found, strict=True), references, strict=True):
         errors = [np.linalg.norm(value - reference) for value in values]
         assert np.polyfit(np.log(counts), -np.log(errors), 1)[0] == pytest.approx(order, abs=0.2)
@@ -45,10 +51,9 @@ def test_points_and_tangents_converge_with_the_order_of_the_step(step, order):
 def test_implicit_euler_inverts_euler_to_rounding(seed, dim, h):
     rng = np.random.default_rng(seed)
     field, s = bent(dim, seed), rng.uniform(-1.5, 1.5, (12, dim))
-    back, _ = implicit_euler(field, euler(field, s, None, -h)[0], None, h)
-    np.testing.assert_allclose(back, s, rtol=0, atol=1e-13)
-    there, _ = euler(field, implicit_euler(field, s, None, h)[0], None, -h)
-    np.testing.assert_allclose(there, s, rtol=0, atol=1e-13)
+    for first, second in ((EULER, IMPLICIT_EULER), (IMPLICIT_EULER, EULER)):
+        there, _ = carried(field, s, None, first, -h)
+        np.testing.assert_allclose(carried(field, there, None, second, h)[0], s, rtol=0, atol=1e-13)
 
 
 @given(seeds, st.sampled_from(STEPS), st.floats(-0.15, 0.15))
@@ -56,10 +61,10 @@ def test_tangents_are_the_derivative_of_the_numerical_step(seed, step, h):
     rng = np.random.default_rng(seed)
     field, s = bent(2, seed), rng.uniform(-1, 1, (5, 2))
     U = rng.normal(size=(5, 2, 3))
-    end, V = step(field, s, U, h)
+    end, V = carried(field, s, U, step, h)
     assert V is not None
-    np.testing.assert_allclose(end, step(field, s, None, h)[0], rtol=0, atol=1e-13)
-    slope = central_differences(lambda points: step(field, points, None, h)[0], s, 1e-4)
+    np.testing.assert_allclose(end, carried(field, s, None, step, h)[0], rtol=0, atol=1e-13)
+    slope = central_differences(lambda points: carried(field, points, None, step, h)[0], s, 1e-4)
     np.testing.assert_allclose(V, slope @ U, rtol=0, atol=1e-6)
 
 
@@ -70,7 +75,7 @@ def test_adaptive_error_falls_with_its_tolerance(duration):
     reference = exact(field, s, duration)
     errors = []
     for tolerance in (1e-4, 1e-6, 1e-8, 1e-10):
-        errors.append(np.abs(integrate_adaptive(field, s, None, duration, tolerance)[0] - reference).max())
+        errors.append(np.abs(adaptively(field, s, duration, tolerance) - reference).max())
         assert errors[-1] < 30 * tolerance
     assert errors[3] < errors[2] < errors[1] < errors[0]
 
@@ -85,32 +90,16 @@ def test_adaptive_is_not_deceived_by_a_first_step_that_is_far_too_long(duration)
     s *= np.linspace(0.001, 0.08, 500)[:, None] / np.linalg.norm(s, axis=1, keepdims=True)
     for temperature in (3.0, 9.0):
         field = Sphere((0.0, 0.0, 0.0), 0.15).field("free-space", temperature)
-        reference, _ = integrate(rk4, field, s, None, duration, 300)
+        reference, _ = carried(field, s, None, RK4, duration, 300)
         for tolerance, largest in ((2e-5, 1e-3), (2e-9, 1e-7)):
-            end, _ = integrate_adaptive(field, s, None, duration, tolerance)
-            assert np.abs(end - reference).max() < largest
+            assert np.abs(adaptively(field, s, duration, tolerance) - reference).max() < largest
 
 
 @pytest.mark.parametrize("distance", [0.0, 1e-9, 1e-6, 1e-3, 1e-2])
 def test_adaptive_steps_are_hardly_ever_tried_in_vain(distance):
     """The first step fits the steep core at once."""
-    field = Counting(Sphere((0.0, 0.0, 0.0), 0.15).field("free-space", 6.0))
-    integrate_adaptive(field, np.array([[distance, 0.0, 0.0]]), None, -1.0, 2e-5)
-    assert len(field.calls) <= 2 + 6 * 9
-
-
-class Counting:
-    """A field that remembers how many points it was asked for."""
-
-    def __init__(self, inner):
-        self.inner, self.dim, self.calls = inner, inner.dim, []
-
-    def __call__(self, s):
-        self.calls.append(len(s))
-        return self.inner(s)
-
-    def with_jacobian(self, s):
-        return self.inner.with_jacobian(s)
+    field = Sphere((0.0, 0.0, 0.0), 0.15).field("free-space", 6.0)
+    adaptively(field, np.array([[distance, 0.0, 0.0]]), -1.0, 2e-5, steps=9)
 
 
 @settings(max_examples=8)
@@ -118,8 +107,8 @@ class Counting:
 def test_adaptive_points_do_not_depend_on_their_batch(seed, duration):
     rng = np.random.default_rng(seed)
     field, s = bent(2, seed, 1.0), rng.uniform(-1.5, 1.5, (8, 2))
-    together, _ = integrate_adaptive(field, s, None, duration, 1e-7)
-    alone = np.concatenate([integrate_adaptive(field, point[None], None, duration, 1e-7)[0] for point in s])
+    together = adaptively(field, s, duration, 1e-7)
+    alone = np.concatenate([adaptively(field, point[None], duration, 1e-7) for point in s])
     np.testing.assert_allclose(together, alone, rtol=0, atol=1e-12)
 
 
@@ -129,8 +118,8 @@ def test_adaptive_tangents_are_the_derivative_of_the_flow(seed):
     rng = np.random.default_rng(seed)
     field, s = bent(2, seed, 0.8), rng.uniform(-1, 1, (5, 2))
     U = rng.normal(size=(5, 2, 2))
-    end, V = integrate_adaptive(field, s, U, 0.8, 1e-11)
-    fine_end, fine = integrate(rk4, field, s, U, 0.8, 150)
+    end, V = carried(field, s, U, DORMAND_PRINCE, 0.8, 1000, 1e-11)
+    fine_end, fine = carried(field, s, U, RK4, 0.8, 150)
     assert V is not None and fine is not None
     np.testing.assert_allclose(end, fine_end, rtol=0, atol=1e-7)
     np.testing.assert_allclose(V, fine, rtol=0, atol=2e-3 * np.abs(fine).max())
@@ -138,41 +127,33 @@ def test_adaptive_tangents_are_the_derivative_of_the_flow(seed):
 
 def test_adaptive_takes_no_points_and_no_time_and_leaves_its_arguments_alone():
     field, U = bent(2, 3), np.broadcast_to(np.eye(2), (3, 2, 2))
-    assert integrate_adaptive(field, np.empty((0, 2)), None, 1.0, 1e-6)[0].shape == (0, 2)
+    assert adaptively(field, np.empty((0, 2)), 1.0, 1e-6).shape == (0, 2)
     s = np.ones((3, 2))
     s.setflags(write=False)
-    np.testing.assert_array_equal(integrate_adaptive(field, s, None, 0.0, 1e-6)[0], s)
-    assert (integrate_adaptive(field, s, U, 1.0, 1e-6)[0] != s).all()
+    np.testing.assert_array_equal(adaptively(field, s, 0.0, 1e-6), s)
+    assert (carried(field, s, U, DORMAND_PRINCE, 1.0, 1000, 1e-6)[0] != s).all()
 
 
 def test_adaptive_gives_up_with_a_reason_on_a_field_that_is_too_steep():
     field = bent(2, 4, 1e4)
     with pytest.raises(ArithmeticError, match="too steep"):
-        integrate_adaptive(field, np.zeros((2, 2)), None, 1.0, 1e-9, max_rounds=20)
+        adaptively(field, np.zeros((2, 2)), 1.0, 1e-9, steps=20)
 
 
-class Saddle:
-    """ṡ = A·s, with the rest point at the origin and the flow exp(t·A) in closed form."""
-
-    dim = 2
-
-    def __init__(self, *rates):
-        self.rates = np.array(rates)
-
-    def __call__(self, s):
-        return s * self.rates
-
-    def with_jacobian(self, s):
-        return self(s), np.broadcast_to(np.diag(self.rates), (len(s), 2, 2))
+def saddle(*rates):
+    """A field that is nearly ṡ = A·s about its rest point, the origin, with these rates; its flow there is exp(t·A)."""
+    grid = GaussianGrid((np.linspace(-2, 2, 9), np.linspace(-2, 2, 9)), 0.5 / 0.7**2)
+    slope = GridRBF(grid, grid.inducing_points).with_jacobian(np.zeros((1, 2)))[1][0]
+    return GridRBF(grid, grid.inducing_points @ np.linalg.inv(slope) * np.array(rates))
 
 
 @pytest.mark.parametrize("tolerance", [1e-5, 1e-7, 1e-9])
 @pytest.mark.parametrize("rates", [(7.0, 6.0), (-7.0, -6.0), (7.0, -6.0)])
 def test_adaptive_tangents_are_right_at_and_near_a_rest_point(tolerance, rates):
     """Where nothing moves, tangents do: the middle of an obstacle, where det J is smallest."""
-    field, t = Saddle(*rates), 0.9
+    field, t = saddle(*rates), 0.9
     s = np.array([[0.0, 0.0], [1e-12, 0.0], [0.0, 1e-9], [1e-7, -1e-7], [1e-5, 1e-5]])
-    V = tangents(integrate_adaptive, field, s, np.broadcast_to(np.eye(2), (5, 2, 2)), t, tolerance)
+    V = tangents(field, s, np.broadcast_to(np.eye(2), (5, 2, 2)), DORMAND_PRINCE, t, 1000, tolerance)
     expected = np.exp(t * np.array(rates))
     np.testing.assert_allclose(np.linalg.det(V), expected.prod(), rtol=0.05)
     assert (np.linalg.det(V) > 0).all()
@@ -184,8 +165,39 @@ def test_adaptive_tangents_are_right_at_and_near_a_rest_point(tolerance, rates):
 @pytest.mark.parametrize("distance", [1e-10, 1e-8, 1e-6, 1e-5, 1e-4])
 def test_adaptive_points_leave_an_unstable_rest_point_as_far_as_they_should(tolerance, distance):
     """An error made early grows as the motion does; it may not grow from nothing into a different motion."""
-    field, t = Saddle(7.0, 6.0), 0.9
+    rates, t = np.array([7.0, 6.0]), 0.9
     s = np.array([[distance, 0.0], [0.0, distance]])
-    end, _ = integrate_adaptive(field, s, None, t, tolerance)
-    growth = np.exp(t * field.rates)
-    np.testing.assert_allclose(np.diag(end), distance * growth, rtol=0.1)
+    end = adaptively(saddle(*rates), s, t, tolerance)
+    np.testing.assert_allclose(np.diag(end), distance * np.exp(t * rates), rtol=0.1)
+
+
+class Plain:
+    """A field of array operations alone."""
+
+    def __init__(self, inner):
+        self.inner, self.dim = inner, inner.dim
+
+    def __call__(self, s):
+        return self.inner(s)
+
+    def with_jacobian(self, s):
+        raise NotImplementedError
+
+
+@pytest.mark.parametrize("method", [EULER, RK4, DORMAND_PRINCE])
+@pytest.mark.parametrize("duration", [-0.7, 0.5])
+def test_fields_of_array_operations_are_carried_along_as_compiled_ones_are(method, duration):
+    rng = np.random.default_rng(8)
+    field, s, U = bent(3, 8, 1.2), rng.uniform(-1, 1, (20, 3)), rng.normal(size=(20, 3, 2))
+    U[3, :, 1] = 0
+    end, V = carried(field, s, U, method, duration, 200, 1e-9)
+    found, W = carried(Plain(field), s, U, method, duration, 200, 1e-9)
+    assert V is not None and W is not None
+    np.testing.assert_allclose(found, end, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(W, V, rtol=0, atol=1e-3 * np.abs(V).max())
+    assert carried(Plain(field), s[:0], U[:0], method, duration, 200, 1e-9)[0].shape == (0, 3)
+
+
+def test_array_operations_give_up_on_a_field_that_is_too_steep_as_well():
+    with pytest.raises(ArithmeticError, match="too steep"):
+        carried(Plain(bent(2, 4, 1e4)), np.zeros((2, 2)), None, DORMAND_PRINCE, 1.0, 20, 1e-9)

@@ -8,7 +8,7 @@ from laws.registry import OBSTACLES, TILTED
 
 from dt_viz.avoidance.arm import WholeArm
 from dt_viz.avoidance.arm_field import WholeArmField
-from dt_viz.flows.integrators import integrate, integrate_adaptive, rk4
+from dt_viz.flows.integrators import DORMAND_PRINCE, RK4, carried
 from dt_viz.kernels.proximity import COMPLEX_STEP
 from dt_viz.obstacles.shapes import as_point
 from dt_viz.obstacles.union import Union
@@ -90,25 +90,24 @@ def test_far_away_and_beyond_a_grid_distances_are_those_of_array_operations(name
 
 @pytest.mark.parametrize("duration", [-0.7, 0.4])
 def test_runge_kutta_steps_are_those_of_array_operations(field, postures, duration):
-    expected, _ = integrate(rk4, Plain(field), postures, None, duration, 5)
-    carried, _ = integrate(rk4, field, postures, None, duration, 5)
-    np.testing.assert_allclose(carried, expected, rtol=0, atol=1e-11)
+    expected, _ = carried(Plain(field), postures, None, RK4, duration, 5)
+    found, _ = carried(field, postures, None, RK4, duration, 5)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-11)
 
 
 def test_adaptive_steps_are_as_exact_as_those_of_array_operations(field, postures):
     """Not the same: array operations take the steps of the strictest posture for all."""
     before = postures.copy()
-    exact, _ = integrate(rk4, field, postures, None, -0.7, 2000)
-    plain, _ = integrate_adaptive(Plain(field), postures, None, -0.7, 1e-8)
-    carried, _ = integrate_adaptive(field, postures, None, -0.7, 1e-8)
-    np.testing.assert_allclose(plain, exact, rtol=0, atol=5e-6)
-    np.testing.assert_allclose(carried, exact, rtol=0, atol=5e-6)
+    exact, _ = carried(field, postures, None, RK4, -0.7, 2000)
+    for each in (Plain(field), field):
+        found, _ = carried(each, postures, None, DORMAND_PRINCE, -0.7, 1000, 1e-8)
+        np.testing.assert_allclose(found, exact, rtol=0, atol=5e-6)
     np.testing.assert_array_equal(postures, before)
 
 
 def test_too_many_steps_are_an_error(field, postures):
     with pytest.raises(ArithmeticError, match="more than 2 steps"):
-        integrate_adaptive(field, postures, None, -0.7, 1e-9, max_rounds=2)
+        carried(field, postures, None, DORMAND_PRINCE, -0.7, 2, 1e-9)
 
 
 def test_no_postures_and_other_layouts_of_memory(field, postures):

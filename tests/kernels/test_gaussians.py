@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+from oracles import carried_by_arrays
 from scipy.special import eval_hermite, expit
 
 from dt_viz.avoidance.bias_fields import RegionField, Shift
 from dt_viz.avoidance.sideways import Sideways
 from dt_viz.flows.fields import GaussianGrid, GridRBF, PlacedField, PointField, Projected, Sum
-from dt_viz.flows.integrators import euler, implicit_euler, integrate, integrate_adaptive, rk4
+from dt_viz.flows.integrators import DORMAND_PRINCE, EULER, IMPLICIT_EULER, RK4, carried
 from dt_viz.kernels.gaussians import LANES, exponential
 from dt_viz.obstacles.occupancy import GENERATORS, AvoidanceField, OccupancyMap
 
@@ -131,7 +132,7 @@ class PlainSideways:
 
 
 def plain_implicit_euler(field, s, U, h, max_iterations=200):
-    """Implicit Euler: the y with y − h·V(y) = s. First order, and the exact inverse of `euler` with −h.
+    """Implicit Euler: the y with y − h·V(y) = s. First order, and the exact inverse of `EULER` with −h.
 
     Newton's method, point by point going back half the way where the residual has grown. While I − h·DV is regular
     everywhere, which is also when the step is invertible, that leads to the one solution from everywhere.
@@ -160,6 +161,12 @@ def plain_implicit_euler(field, s, U, h, max_iterations=200):
     if U is None:
         return y, None
     return y, np.linalg.solve(identity - h * field.with_jacobian(y)[1], U)
+
+
+def carried_implicitly(field, s, U, _method, duration, steps):
+    for _ in range(steps):
+        s, U = plain_implicit_euler(field, s, U, duration / steps)
+    return s, U
 
 
 def cases():
@@ -215,18 +222,19 @@ def test_any_number_of_points_gives_what_each_gives_alone(pair, num):
     alone = [field.with_jacobian(point[None]) for point in s]
     for found, expected in zip(field.with_jacobian(s), zip(*alone, strict=True), strict=True):
         np.testing.assert_allclose(found, np.concatenate(expected), rtol=0, atol=1e-12)
-    ends = integrate_adaptive(field, s, None, -0.4, 1e-6)[0]
-    expected = np.concatenate([integrate_adaptive(field, point[None], None, -0.4, 1e-6)[0] for point in s])
+    ends = carried(field, s, None, DORMAND_PRINCE, -0.4, 1000, 1e-6)[0]
+    expected = np.concatenate([carried(field, point[None], None, DORMAND_PRINCE, -0.4, 1000, 1e-6)[0] for point in s])
     np.testing.assert_allclose(ends, expected, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("step", [euler, implicit_euler, rk4])
+@pytest.mark.parametrize("step", [EULER, IMPLICIT_EULER, RK4])
 def test_steps_are_those_of_array_operations(pair, step):
     field, plain = pair
     s, U = points(field.dim), np.random.default_rng(2).normal(size=(60, field.dim, 2))
     for tangents in (None, U):
-        end, V = integrate(step, field, s, tangents, 0.2, 5)
-        expected, W = integrate(plain_implicit_euler if step is implicit_euler else step, plain, s, tangents, 0.2, 5)
+        end, V = carried(field, s, tangents, step, 0.2, 5)
+        by_arrays = carried_implicitly if step == IMPLICIT_EULER else carried_by_arrays
+        expected, W = by_arrays(plain, s, tangents, step, 0.2, 5)
         np.testing.assert_allclose(end, expected, rtol=0, atol=1e-12)
         if V is not None and W is not None:
             np.testing.assert_allclose(V, W, rtol=0, atol=1e-10 * np.abs(W).max())
@@ -238,8 +246,8 @@ def test_adaptive_steps_are_as_exact_as_those_of_array_operations(pair, duration
     s, U = points(field.dim), np.random.default_rng(2).normal(size=(60, field.dim, 2))
     before = s.copy()
     for tangents in (None, U):
-        end, V = integrate_adaptive(field, s, tangents, duration, 1e-6)
-        expected, W = integrate_adaptive(plain, s, tangents, duration, 1e-6)
+        end, V = carried(field, s, tangents, DORMAND_PRINCE, duration, 1000, 1e-6)
+        expected, W = carried_by_arrays(plain, s, tangents, RK4, duration, 60)
         np.testing.assert_allclose(end, expected, rtol=0, atol=1e-5)
         if V is not None and W is not None:
             np.testing.assert_allclose(V, W, rtol=0, atol=1e-2 * np.abs(W).max())

@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from laws.registry import TRANSFORMS
+from oracles import stepped
 
 from dt_viz.avoidance.avoidance import ArmAvoidance  # its flow is one of joints: see tests/avoidance/test_arm.py
 from dt_viz.avoidance.registry import KINDS
 from dt_viz.avoidance.transform import Anchored, MotionBelow
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain, Flow, Integration, min_det_jacobian, round_trip_error
 from dt_viz.flows.fields import GaussianGrid, GridRBF
-from dt_viz.flows.integrators import euler, implicit_euler
+from dt_viz.flows.integrators import EULER, IMPLICIT_EULER
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
 from dt_viz.scenario.scenario import Layer, Scenario
 
@@ -24,7 +25,7 @@ def below() -> DiffeomorphicSystem:
     """A bent motion from left to right, as what was learned."""
     grid = GaussianGrid(tuple(np.linspace(c - 0.3, c + 0.3, 4) for c in (0.0, -0.42, 0.3)), 0.5 / 0.2**2)
     field = GridRBF(grid, 0.03 * np.random.default_rng(9).normal(size=(grid.num_points, 3)))
-    psi = Flow(field, 1.0, 4, implicit_euler, euler)
+    psi = Flow(field, 1.0, 4, IMPLICIT_EULER, EULER)
     return DiffeomorphicSystem(psi, Attractor(psi.forward(GOAL), 0.15, 0.03))
 
 
@@ -98,7 +99,7 @@ def test_the_system_with_it_is_conjugate_to_the_one_without_and_its_motions_are_
     system = DiffeomorphicSystem(psi, replace(below().base, goal=psi.forward(built(transform).goal)))
     starts, times = built(transform).transform.inverse(STARTS[:2]), np.linspace(0.0, 2.0, 3)
     exact = system.rollout(starts, times)
-    np.testing.assert_allclose(system.stepped_rollout(starts, times, 10), exact, rtol=0, atol=5e-4)
+    np.testing.assert_allclose(stepped(system.velocity, starts, times, 10), exact, rtol=0, atol=5e-4)
     np.testing.assert_allclose(exact[:, 0], starts, rtol=0, atol=1e-6)
     end = system.rollout(starts, np.array([300.0]))[:, 0]
     np.testing.assert_allclose(end, np.broadcast_to(built(transform).goal, end.shape), rtol=0, atol=1e-6)
@@ -116,7 +117,7 @@ def test_another_attempt_needs_no_less_flow_time(transform, built):
 def test_other_steps_are_taken_where_they_are_chosen(transform, built):
     by_euler = replace(transform, integration=Integration("euler", 7)).build(motion())
     flows = [part for part in Chain([by_euler.transform]).parts if isinstance(part, Flow | AdaptiveFlow)]
-    assert {(flow.step, flow.steps) for flow in flows if isinstance(flow, Flow)} == {(euler, 7)}
+    assert {(flow.method, flow.steps) for flow in flows if isinstance(flow, Flow)} == {(EULER, 7)}
     assert all(isinstance(flow, Flow) for flow in flows) and by_euler.integration == Integration("euler", 7)
 
 

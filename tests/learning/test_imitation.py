@@ -10,7 +10,7 @@ import pytest
 from dt_viz.errors import FormatError
 from dt_viz.flows.diffeomorphisms import Flow, min_det_jacobian
 from dt_viz.flows.fields import GaussianGrid, GridRBF
-from dt_viz.flows.integrators import euler, implicit_euler
+from dt_viz.flows.integrators import EULER, IMPLICIT_EULER, carried
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.flow_chain import FlowChain, FlowLayer, equally_spaced_grid, min_step_determinant
 from dt_viz.learning.imitation import Imitation, ImitationSettings, fit
@@ -225,8 +225,8 @@ def test_a_step_that_nearly_folds_is_still_inverted_exactly(seed):
         h *= 0.9
     y = rng.uniform(-2, 2, (2000, 2))
     assert min_step_determinant(field, 200.0) < 0
-    x, _ = euler(field, y, None, h)
-    assert np.abs(implicit_euler(field, x, None, -h)[0] - y).max() < 1e-12
+    x, _ = carried(field, y, None, EULER, h)
+    assert np.abs(carried(field, x, None, IMPLICIT_EULER, -h)[0] - y).max() < 1e-12
 
 
 # ---- input that is not as it should be ----

@@ -5,12 +5,12 @@ from functools import partial
 
 import numpy as np
 import pytest
-from oracles import central_differences
+from oracles import central_differences, stepped
 from scenes import changed
 
 from dt_viz.control.arm_system import ArmSystem, Section
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Flow, Identity
-from dt_viz.flows.systems import Attractor, DiffeomorphicSystem, stepped
+from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
 from dt_viz.metrics import resample_by_arc_length
 from dt_viz.motion.following import Follower
 from dt_viz.motion.stack import LIVE

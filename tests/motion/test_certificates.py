@@ -12,7 +12,7 @@ from scenes import changed, frame_at, kinds
 from dt_viz.avoidance.arm_field import LEVERS
 from dt_viz.flows.diffeomorphisms import Diffeomorphism, Flow, Identity
 from dt_viz.flows.fields import Array, GaussianGrid, GridRBF
-from dt_viz.flows.integrators import euler, implicit_euler
+from dt_viz.flows.integrators import EULER, IMPLICIT_EULER
 from dt_viz.flows.rollouts import ARRIVED, Bundle, Rays, evenly_sampled
 from dt_viz.flows.systems import Attractor
 from dt_viz.motion.certificates import MAX_OFF, MAX_OFF_POSTURE, Certificates, DrawnSamples, certified
@@ -68,7 +68,7 @@ def certificates_of(shown: DrawnSamples | Bundle = SHOWN, transform: Diffeomorph
 
 
 @pytest.mark.parametrize(
-    "transform", [IDENTITY, Flow(field(0.3), 0.5, 20), Flow(field(0.3), 0.5, 6, implicit_euler, euler)]
+    "transform", [IDENTITY, Flow(field(0.3), 0.5, 20), Flow(field(0.3), 0.5, 6, IMPLICIT_EULER, EULER)]
 )
 def test_a_sound_stack_gets_its_certificates_and_no_warning(transform):
     bundle = bundle_of(transform)
@@ -81,7 +81,7 @@ def test_a_sound_stack_gets_its_certificates_and_no_warning(transform):
 
 
 def test_a_folding_euler_map_is_recognised():
-    known = certificates_of(transform=Flow(field(6.0), 1.0, 1, euler))  # straight through where it folds
+    known = certificates_of(transform=Flow(field(6.0), 1.0, 1, EULER))  # straight through where it folds
     assert known.min_det_jacobian is not None and known.min_det_jacobian < 0
     assert Kind.NO_DIFFEOMORPHISM in kinds(known.warnings)
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from oracles import central_differences
 from scipy.special import expit
 
-from dt_viz.flows.integrators import integrate_adaptive
+from dt_viz.flows.diffeomorphisms import AdaptiveFlow
 from dt_viz.obstacles.learned_maps import unit_map
 from dt_viz.obstacles.occupancy import GENERATORS, AvoidanceField, fit_occupancy, sample_labels
 from dt_viz.obstacles.shapes import ORIGIN, Sphere
@@ -126,7 +126,7 @@ def test_samples_lie_in_the_grown_box_and_half_of_them_close_to_the_shape():
 def test_deep_points_stay_under_the_probability_generator():
     """The contrast that "free-space" is there for: where p saturates, its gradient is dead."""
     deep = 0.1 * directions(100)
-    ends = {g: integrate_adaptive(AvoidanceField(BALL, g), deep, None, -1.0, 1e-6)[0] for g in GENERATORS}
+    ends = {g: AdaptiveFlow(AvoidanceField(BALL, g), 1.0, 1e-6).inverse(deep) for g in GENERATORS}
     assert np.linalg.norm(ends["probability"], axis=1).max() < 0.5
     assert np.linalg.norm(ends["free-space"], axis=1).min() > 1.0
 
@@ -137,7 +137,7 @@ def test_occupancy_never_rises_along_the_reverse_flow(generator):
     s = in_ball(200, 1.5)
     logits = [BALL.logit(s)]
     for _ in range(20):
-        s, _ = integrate_adaptive(V, s, None, -0.1, 1e-7)
+        s = AdaptiveFlow(V, 0.1, 1e-7).inverse(s)
         logits.append(BALL.logit(s))
     assert np.diff(logits, axis=0).max() <= 1e-9
     assert np.diff(logits, axis=0).min() < -0.1

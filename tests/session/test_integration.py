@@ -10,7 +10,7 @@ from dt_viz.avoidance.placement import bias_beside
 from dt_viz.avoidance.registry import AVOIDANCE
 from dt_viz.flows.diffeomorphisms import AUTO, METHODS, AdaptiveFlow, Chain, Conjugated, Flow, Integration
 from dt_viz.flows.fields import GaussianGrid, GridRBF
-from dt_viz.flows.integrators import euler, rk4
+from dt_viz.flows.integrators import EULER, RK4
 from dt_viz.motion.diagnostics import fold_warnings, integration_warnings
 from dt_viz.scenario.stack import WHOLE_ARM, surroundings
 from dt_viz.session.frame import Stage
@@ -28,8 +28,8 @@ Y = np.random.default_rng(1).uniform(-0.8, 0.8, (200, 3))
 def test_auto_leaves_a_flow_as_it_is_and_others_take_their_steps():
     for flow in (Flow(field(), 0.7, 13), AdaptiveFlow(field(), 0.7)):
         assert AUTO.of(flow) is flow
-        assert Integration("euler", 3).of(flow) == Flow(flow.field, 0.7, 3, euler)
-        assert Integration("rk4", 5).of(flow) == Flow(flow.field, 0.7, 5, rk4)
+        assert Integration("euler", 3).of(flow) == Flow(flow.field, 0.7, 3, EULER)
+        assert Integration("rk4", 5).of(flow) == Flow(flow.field, 0.7, 5, RK4)
 
 
 def test_names_are_those_of_the_page():
