@@ -16,7 +16,7 @@ import numpy as np
 from dt_viz.flows.diffeomorphisms import Diffeomorphism
 from dt_viz.flows.fields import Array, CompiledField
 from dt_viz.kernels import escape
-from dt_viz.kernels.dormand_prince import DORMAND_PRINCE, RATE, RK4
+from dt_viz.kernels.dormand_prince import RATE
 from dt_viz.kernels.joint_limits import stretched
 from dt_viz.obstacles.arrays import records
 from dt_viz.obstacles.shapes import Obstacle
@@ -134,17 +134,10 @@ class WholeArmField(ArmField, CompiledField):
 
     def __call__(self, q: Array) -> Array:
         """Compute V_q at configurations `q` (N, 6), as (N, 6)."""
-        return self._carried(q, RATE)
+        return self.carried(q, RATE)
 
-    def rk4(self, s: Array, duration: float, steps: int) -> Array:
-        return self._carried(s, RK4, duration, steps)
-
-    def dormand_prince(self, s: Array, duration: float, tolerance: float, max_steps: int) -> Array:
-        return self._carried(s, DORMAND_PRINCE, duration, max_steps, tolerance)
-
-    def _carried(self, q: Array, method: int, duration: float = 0.0, steps: int = 1, tolerance: float = 0.0) -> Array:
-        """Carry configurations `q` (N, 6) along the flow; see `dt_viz.kernels.flows.carry`."""
-        q = np.array(q, order="C")
+    def carried(self, s: Array, method: int, duration: float = 0.0, steps: int = 1, tolerance: float = 0.0) -> Array:
+        q = np.array(s, order="C")
         if num_failed := escape.carry(self._escape, q, method, float(duration), int(steps), float(tolerance)):
             raise ArithmeticError(f"{num_failed} postures need more than {steps} steps")
         return q

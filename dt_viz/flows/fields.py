@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dt_viz.kernels.dormand_prince import RATE, RK4
+from dt_viz.kernels.dormand_prince import RATE
 from dt_viz.kernels.fields import GRID, TERM, Terms
 from dt_viz.kernels.flows import carry
 from dt_viz.numerics import Array, Indices, Mask  # noqa: F401 - other packages import them with the fields
@@ -37,18 +37,12 @@ class CompiledField(ABC):
     """Mixin of a `VectorField` whose flow is a compiled loop over the points, without tangents."""
 
     @abstractmethod
-    def rk4(self, s: Array, duration: float, steps: int) -> Array:
-        """Carry the points `s` (N, d) along in equal steps of the classical Runge–Kutta method."""
+    def carried(self, s: Array, method: int, duration: float = 0.0, steps: int = 1, tolerance: float = 0.0) -> Array:
+        """Carry points `s` (N, d) along by an explicit method; see `dt_viz.kernels.flows.carry`.
 
-    @abstractmethod
-    def dormand_prince(self, s: Array, duration: float, tolerance: float, max_steps: int) -> Array:
-        """Carry the points `s` (N, d) along in adaptive steps. Raises ArithmeticError where they are too many."""
-
-    def carried(self, s: Array, method: int, duration: float, steps: int, tolerance: float) -> Array:
-        """Carry the points `s` (N, d) along by one of these methods; see `dt_viz.flows.integrators.carried`."""
-        if method == RK4:
-            return self.rk4(s, duration, steps)
-        return self.dormand_prince(s, duration, tolerance, steps)
+        Raises:
+            ArithmeticError: some point needs more adaptive steps than `steps`.
+        """
 
 
 class PointField(ABC):

@@ -54,7 +54,7 @@ def carried(
         return field.carried(s, U, method, duration, steps, tolerance)
     if U is not None:
         return _by_differences(lambda points: carried(field, points, None, method, duration, steps, tolerance)[0], s, U)
-    if isinstance(field, CompiledField) and method != EULER:
+    if isinstance(field, CompiledField):
         return field.carried(s, method, duration, steps, tolerance), None
     if method == DORMAND_PRINCE:
         return _adaptively(field, s, duration, steps, tolerance), None

@@ -117,9 +117,7 @@ def _carry_adaptively(
 ) -> int:
     """Carry states (N, m) with the rates `first` (N, m) along, in place, each with steps of its own.
 
-    Returns how many need more than `max_steps`.
-
-    See `dt_viz.flows.integrators.integrate_adaptive`. Where a state has arrived, another takes its lane.
+    Returns how many need more than `max_steps`. Where a state has arrived, another takes its lane.
     """
     m, total, sign = states.shape[1], abs(duration), 1.0 if duration > 0 else -1.0
     waiting = moving(first)
