@@ -35,6 +35,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy.io
@@ -234,6 +235,16 @@ def read_demonstrations(content: bytes, source: str | Path, *, rate: float | Non
     with parsing(DemonstrationError, source, "file", accepted):
         demonstrations, lines = read(content, source, rate)
     return check_demonstrations(demonstrations, source, lines)
+
+
+def save_demonstrations(path: str | Path, demonstrations: Sequence[Demonstration]) -> None:
+    """Write demonstrations as npz: ``times_i``, ``positions_i`` and ``name_i`` for i = 0, 1, …."""
+    arrays: dict[str, Any] = {
+        f"{field}_{i}": np.asarray(getattr(demonstration, field))
+        for i, demonstration in enumerate(demonstrations)
+        for field in ("times", "positions", "name")
+    }
+    np.savez_compressed(path, **arrays)
 
 
 def lasa_files(folder: str | Path) -> dict[str, Path]:

@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 from hook import NUM_DEMONSTRATIONS, apart, hook
 from PIL import Image
-from recordings import save_demonstrations
 
 from dt_viz.evaluate import figures, imitation
 from dt_viz.evaluate.__main__ import main
 from dt_viz.evaluate.figures import FigurePanel
 from dt_viz.evaluate.held_out import WAYS, follow
-from dt_viz.learning.demonstrations import Demonstration
+from dt_viz.learning.demonstrations import Demonstration, save_demonstrations
 from dt_viz.learning.imitation import fit, grown_grid
 from dt_viz.metrics import resample_by_arc_length, rms_at_equal_times
 

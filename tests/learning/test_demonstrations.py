@@ -11,7 +11,6 @@ import scipy.io
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from recordings import save_demonstrations
 
 from dt_viz.learning.demonstrations import (
     MAX_BYTES,
@@ -22,6 +21,7 @@ from dt_viz.learning.demonstrations import (
     lasa_files,
     load_demonstrations,
     read_demonstrations,
+    save_demonstrations,
 )
 
 SUFFIXES = [".csv", ".npz", ".mat"]

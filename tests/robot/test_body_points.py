@@ -13,7 +13,8 @@ from scipy.spatial import KDTree
 
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.robot.body_points import PROTRUSION, BodyPoints, load_body_points
-from dt_viz.robot.collision import SELF_REACH, SELF_TOLERANCE, load_collision_model
+from dt_viz.robot.collision import SELF_REACH, load_collision_model
+from dt_viz.robot.link_distances import SELF_TOLERANCE
 from dt_viz.robot.robot import LinkMesh, collision_meshes
 from dt_viz.shipped import ASSETS
 
