@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -42,10 +42,6 @@ class _Record:
     """Without curves and arm; None until its motions are planned."""
     is_complete: bool = False
     """Whether nothing is left to work out."""
-    curves: dict[int, Array] = field(default_factory=dict)
-    """Those of `Compared`, by the rollout."""
-    arms: dict[int, ArmMotion] = field(default_factory=dict)
-    """Motions of the arm, by the rollout that they follow."""
 
 
 def _around(method: Method, learned: Learned, frame: Frame) -> tuple[Hashable, ...]:
@@ -117,15 +113,13 @@ class Comparison:
         """What is known of a method; `waiting` is its note while its motions are not."""
         record = self._record(method, learned, frame)
         known = record.known or Compared(method, note=waiting)
+        if not known.paths:
+            return known
         rollout = frame.chosen if frame.chosen is not None and frame.chosen < len(learned.task.starts) else 0
-        if known.paths and rollout not in record.curves:
-            path, demonstration = known.paths[rollout], learned.task.paths[rollout]
-            record.curves[rollout] = curves(path, demonstration, frame.scenario.obstacle)
-        shows_arm = frame.scenario.view.their_arm == method.name
-        if shows_arm and rollout not in record.arms and known.times and len(known.times[rollout]) > 1:
-            record.arms[rollout] = self._arm(known, learned, rollout)
-        arm = record.arms.get(rollout) if shows_arm else None
-        return replace(known, rollout=rollout, curves=record.curves.get(rollout), arm=arm)
+        shows_arm = frame.scenario.view.their_arm == method.name and len(known.times[rollout]) > 1
+        arm = self._arm(record, learned, rollout) if shows_arm else None
+        path, demonstration = known.paths[rollout], learned.task.paths[rollout]
+        return replace(known, rollout=rollout, curves=curves(path, demonstration, frame.scenario.obstacle), arm=arm)
 
     def _plan(self, method: Method, frame: Frame, learned: Learned, cancelled: Cancelled = never) -> None:
         """Plan a method's motions unless they are known; those that do not avoid are the same around all obstacles."""
@@ -165,8 +159,11 @@ class Comparison:
     def _problem(self, learned: Learned) -> Problem:
         return problem_of(learned, self._follower)
 
-    def _arm(self, known: Compared, learned: Learned, rollout: int) -> ArmMotion:
-        """The arm's motion along a rollout of a method."""
+    @kept(NEWEST, by=lambda record, _, rollout: (record, rollout))
+    def _arm(self, record: _Record, learned: Learned, rollout: int) -> ArmMotion:
+        """The arm's motion along a rollout of a method whose motions are planned."""
+        known = record.known
+        assert known is not None
         q, times = self._joints(known, learned, rollout), known.times[rollout]
         if known.joints is None:
             times = times[_tracked(len(times))]

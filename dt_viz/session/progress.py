@@ -94,6 +94,8 @@ class Screen:
         self.progress = Progress(wanted)
         self._pace = self.progress.pace
         """Of the newest frame."""
+        self._learned = -math.inf
+        """Time of the newest news of learning, of `time.perf_counter`."""
         self._live_frames: deque[float] = deque(maxlen=120)
         """Times of the newest frames of stage LIVE, of `time.perf_counter`."""
 
@@ -107,6 +109,8 @@ class Screen:
     def tell(self, **changes: Any) -> None:  # noqa: ANN401 - the fields of Progress
         """Change the progress and show it."""
         with self._telling:
+            if changes.get("learning") is not None:
+                self._learned = time.perf_counter()
             self.progress = replace(self.progress, **changes)
             self._display.tell(self.progress)
 
@@ -117,7 +121,7 @@ class Screen:
     def draw(self, frame: Frame, edited: float, num_skipped: int) -> None:
         """Show a frame whose scenario was asked for at a time, of `time.perf_counter`; learning is no rebuild."""
         now = time.perf_counter()
-        latency = frame.seconds if self.progress.learning is not None else now - edited
+        latency = now - max(edited, self._learned)
         if frame.stage is Stage.LIVE:
             self._live_frames.append(now)
         rate = sum(now - t <= 1.0 for t in self._live_frames)
