@@ -72,8 +72,8 @@ class PaperScene:
 
     def is_changed(self, scenario: Scenario, task: Task) -> bool:
         """Return whether the stack differs from the scene's own."""
-        own, followed = _own(self.name, task), {"starts": scenario.starts, "arm_rollout": scenario.arm_rollout}
-        return scenario.choices != replace(own, warp=scenario.warp, **followed).choices
+        free = {name: getattr(scenario, name) for name in ("warp", "starts", "arm_rollout")}
+        return scenario.choices != replace(self.scenario(task), **free).choices
 
 
 def _avoiding(task: Task, avoidance: Avoidance) -> Scenario:
@@ -307,9 +307,3 @@ SCENES: Mapping[str, PaperScene] = {
 def offered(tasks: Container[str]) -> tuple[PaperScene, ...]:
     """Return the scenes whose tasks are all among these: those of the LASA data only where the user has them."""
     return tuple(scene for scene in SCENES.values() if all(name in tasks for name in scene.tasks))
-
-
-@lru_cache(maxsize=64)
-def _own(name: str, task: Task) -> Scenario:
-    """Return the scenario of a scene; a page asks for it with each frame."""
-    return SCENES[name].scenario(task)

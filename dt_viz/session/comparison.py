@@ -66,9 +66,6 @@ class Comparison:
             learned: its task, learned.
             notes: what is said of methods, by their names, while they are not planned.
         """
-        for method in _chosen(frame):
-            if method.live:
-                self._plan(method, frame, learned)
         return tuple(
             self._compared(method, frame, learned, (notes or {}).get(method.name, WAITS)) for method in _chosen(frame)
         )
@@ -111,6 +108,8 @@ class Comparison:
 
     def _compared(self, method: Method, frame: Frame, learned: Learned, waiting: str) -> Compared:
         """What is known of a method; `waiting` is its note while its motions are not."""
+        if method.live:
+            self._plan(method, frame, learned)
         record = self._record(method, learned, frame)
         known = record.known or Compared(method, note=waiting)
         if not known.paths:
@@ -179,24 +178,15 @@ class Comparison:
 
     def _arm_depth(self, known: Compared, frame: Frame, learned: Learned, cancelled: Cancelled) -> float | None:
         """How deep the arm's meshes enter the obstacle along motions, metres; None where it cannot follow."""
+        model, depth, ours = load_collision_model(), 0.0, known.method is OURS
         try:
-            if known.method is OURS:
-                rollouts = range(len(frame.rollouts))
-                joints = [arm_along(frame, k, self._follower)[0].q for k in rollouts]
-            else:
-                joints = [self._joints(known, learned, k) for k in range(len(known.paths))]
+            for k in range(len(frame.rollouts if ours else known.paths)):
+                end_if(cancelled)
+                q = arm_along(frame, k, self._follower)[0].q if ours else self._joints(known, learned, k)
+                depth = max(depth, -model.nearest_to_obstacle(q, frame.scenario.obstacle).distance)
         except UnreachableError:
             return None
-        return _deepest(joints, frame.scenario.obstacle, cancelled)
-
-
-def _deepest(joints: list[Array], obstacle: Union, cancelled: Cancelled) -> float:
-    """How deep the arm's meshes enter an obstacle along postures (N_i, 6), rad, metres; 0 when they are clear."""
-    model, depth = load_collision_model(), 0.0
-    for q in joints:
-        end_if(cancelled)
-        depth = max(depth, -model.nearest_to_obstacle(q, obstacle).distance)
-    return depth
+        return depth
 
 
 def scored(paths: tuple[Array, ...], task: Task, goal: Array, obstacle: Union) -> Scores:

@@ -91,6 +91,8 @@ def velocities(frame: Frame, learned: Array) -> Array:
     moves nothing.
     """
     points, built = lattice(frame), frame.motion.stack.built
+    if not built:
+        return learned
     free = _avoided(built).signed_distance(points) > 0
     stacked = Chain([Identity(3), *(applied.made.transform for applied in built)])
     spread = np.full_like(points, np.nan)
@@ -128,12 +130,8 @@ class Drawing:
             others: the learned motions that panels of other tasks show.
             coarse: whether they are to follow a drag.
         """
-        motion, view, area, built = (
-            frame.motion,
-            frame.scenario.view,
-            frame.slice,
-            frame.motion.stack.built[: frame.level],
-        )
+        motion, view, area = frame.motion, frame.scenario.view, frame.slice
+        built = motion.stack.built[: frame.level]
         own = self._book(motion.below.learned, rest(frame))
         books = {None: own, **{panel: self._book(each, each.demonstrated.rest(0)) for panel, each in others.items()}}
         clearance, system = _avoided(built).signed_distance, system_of(frame, len(built))

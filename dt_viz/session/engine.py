@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from dt_viz.avoidance.avoidance import Avoidance
-from dt_viz.avoidance.transform import Transform
 from dt_viz.errors import Cancelled, never
 from dt_viz.learning.augmented import AugmentedImitation, fit_augmented
 from dt_viz.learning.imitation import ImitationSettings, Progress
@@ -300,8 +299,5 @@ class Engine:
 
 def _without_obstacles(stack: tuple[Layer, ...]) -> tuple[Layer, ...]:
     """The stack with all that avoids switched off."""
-    return tuple(replace(layer, on=layer.on and not _avoids(layer.transform)) for layer in stack)
-
-
-def _avoids(transform: Transform) -> bool:
-    return isinstance(transform, Avoidance) or bool(transform.avoided.parts)
+    avoids = [isinstance(layer.transform, Avoidance) or bool(layer.transform.avoided.parts) for layer in stack]
+    return tuple(replace(layer, on=layer.on and not off) for layer, off in zip(stack, avoids, strict=True))

@@ -32,8 +32,6 @@ REST = 0.1
 """Time that a scenario must rest before it is refined, seconds: while a hand moves, edits come faster."""
 LANE = "session"
 """Lane of the jobs on which the newest scenario is computed."""
-_Job = tuple[Scenario, float]
-"""A scenario to compute, and when it was asked for, seconds."""
 
 
 def _with_a_level_of_its_own(scenario: Scenario) -> Scenario:
@@ -256,20 +254,21 @@ class Session:
         if self._screen.progress.failed:
             self._screen.tell(failed=False)
         self._engine.see(self.scenario)
-        compute = partial(self._compute, (self.scenario, time.perf_counter()))
+        compute = partial(self._compute, self.scenario, time.perf_counter())
         self._num_skipped += self.jobs.submit(LANE, compute, latest=True)
 
-    def _compute(self, job: _Job) -> None:
+    def _compute(self, scenario: Scenario, edited: float) -> None:
+        """Show the frames of a scenario that was wanted at a time, of `time.perf_counter`."""
         superseded = partial(self.jobs.superseded, LANE)
         try:
-            self._show_frames(job, superseded)
+            self._show_frames(self._decided(scenario), edited, superseded)
         except UnwantedError:
             raise
         except Exception as error:
             with self._lock:
                 self._screen.tell(failed=True)
-                returned = isinstance(error, DataError | ImitationError) and self._retreat(job[0])
-                if not returned and self.scenario != job[0] and not superseded():
+                returned = isinstance(error, DataError | ImitationError) and self._retreat(scenario)
+                if not returned and self.scenario != scenario and not superseded():
                     self._submit()  # it was edited meanwhile, and seemed to need no frames of its own
             if returned:
                 self._adopt()
@@ -296,8 +295,7 @@ class Session:
                 self.scenario = replace(self.scenario, passing=passing)
         return replace(scenario, passing=passing)
 
-    def _show_frames(self, job: _Job, superseded: Callable[[], bool]) -> None:
-        scenario, edited = self._decided(job[0]), job[1]
+    def _show_frames(self, scenario: Scenario, edited: float, superseded: Callable[[], bool]) -> None:
         self._catch_up()
         for frame in self._engine.frames(scenario, partial(self._learn, scenario), superseded):
             drawn = self._shown is not None and scenario.choices == self._shown.scenario.choices
