@@ -90,9 +90,10 @@ def velocities(frame: Frame, learned: Array) -> Array:
     Places inside an obstacle have none, NaN. They are `learned` (M, 3), those of the learned motion, where the stack
     moves nothing.
     """
-    points, built = lattice(frame), frame.motion.stack.built
+    built = frame.motion.stack.built
     if not built:
         return learned
+    points = lattice(frame)
     free = _avoided(built).signed_distance(points) > 0
     stacked = Chain([Identity(3), *(applied.made.transform for applied in built)])
     spread = np.full_like(points, np.nan)
