@@ -141,3 +141,21 @@ def test_what_viser_keeps_to_itself_is_used_in_one_file():
 @pytest.mark.parametrize("module", ONLY_IMPORTERS)
 def test_only_one_place_talks_to(module):
     assert importers(module) == ONLY_IMPORTERS[module]
+
+
+def attributes_of(node: ast.ClassDef) -> set[str]:
+    """Names of a class's instance attributes: its fields, and what is assigned to `self`."""
+    fields = {
+        part.target.id for part in node.body if isinstance(part, ast.AnnAssign) and isinstance(part.target, ast.Name)
+    }
+    stored = [part for part in ast.walk(node) if isinstance(part, ast.Attribute) and isinstance(part.ctx, ast.Store)]
+    return fields | {part.attr for part in stored if isinstance(part.value, ast.Name) and part.value.id == "self"}
+
+
+def test_only_frozen_values_have_more_than_twelve_attributes():
+    nodes = [node for path in SOURCES for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))]
+    classes = [node for node in nodes if isinstance(node, ast.ClassDef)]
+    large = [node for node in classes if len(attributes_of(node)) > 12]
+    assert {"Scenario", "View"} <= {node.name for node in large}
+    told = {node.name: " ".join(map(ast.unparse, [*node.decorator_list, *node.bases])) for node in large}
+    assert [name for name, kind in told.items() if "frozen=True" not in kind and kind != "NamedTuple"] == []

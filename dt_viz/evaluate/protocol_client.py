@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from importlib.metadata import version
 from types import TracebackType
 from typing import Any, TypeVar
@@ -51,8 +52,15 @@ class ProtocolClient:
             origin: origin of the page that it imitates; None sends none.
             protocol: WebSocket subprotocol; that of the installed viser if None.
         """
-        self._url, self._origin = url, origin
-        self._protocol = Subprotocol(protocol or f"viser-v{version('viser')}")
+        self._connect = partial(
+            connect,
+            url,
+            origin=None if origin is None else websockets.Origin(origin),
+            subprotocols=[Subprotocol(protocol or f"viser-v{version('viser')}")],
+            compression=None,
+            max_size=MAX_MESSAGE,
+            proxy=None,
+        )
         self.nodes: dict[str, dict[str, Any]] = {}
         """Properties of the scene's nodes, by name; arrays are flat."""
         self.controls: dict[str, dict[str, Any]] = {}
@@ -67,14 +75,7 @@ class ProtocolClient:
         self._ended: Exception | None = None
 
     async def __aenter__(self: T) -> T:
-        self._socket: ClientConnection = await connect(
-            self._url,
-            origin=websockets.Origin(self._origin) if self._origin is not None else None,
-            subprotocols=[self._protocol],
-            compression=None,
-            max_size=MAX_MESSAGE,
-            proxy=None,
-        )
+        self._socket: ClientConnection = await self._connect()
         self._receiving = asyncio.create_task(self._receive())
         return self
 

@@ -73,8 +73,8 @@ class PaperScene:
 
     def is_changed(self, scenario: Scenario, task: Task) -> bool:
         """Return whether the stack differs from the scene's own."""
-        own, followed = _own(self.name, task), {"starts": scenario.starts, "arm_rollout": scenario.arm_rollout}
-        return scenario.choices != replace(own, warp=scenario.warp, **followed).choices
+        free = {name: getattr(scenario, name) for name in ("warp", "starts", "arm_rollout")}
+        return scenario.choices != replace(self.scenario(task), **free).choices
 
 
 def _avoiding(task: Task, avoidance: Avoidance) -> Scenario:
@@ -106,19 +106,9 @@ def _bottle_in_the_way(task: Task) -> Scenario:
     return _avoiding(task, ArmAvoidance(MeshObstacle((float(x), float(y), 0.0), bottle())))
 
 
-def _sphere_in_the_letter(task: Task) -> Scenario:
-    """Fig. 2."""
-    return _avoiding(task, Avoidance(Sphere(task.obstacle_position), plane=plane_of(task)))
-
-
-def _sphere_in_the_8(task: Task) -> Scenario:
-    """Sec. 6: a small sphere, so that the 8 remains one."""
-    return _avoiding(task, Avoidance(Sphere(task.obstacle_position, 0.09), plane=plane_of(task)))
-
-
-def _in_style(task: Task) -> Scenario:
-    """Sec. 6: a letter in the style of another hand."""
-    return replace(_alone(task), style="wavy")
+def _sphere_in_the_letter(diameter: float) -> Callable[[Task], Scenario]:
+    """Return what makes the scenario of fig. 2."""
+    return lambda task: _avoiding(task, Avoidance(Sphere(task.obstacle_position, diameter), plane=plane_of(task)))
 
 
 def _cube_before_the_attractor(task: Task) -> Scenario:
@@ -191,24 +181,24 @@ def release(pot: Pot) -> Point:
     return x, y, z + 0.16
 
 
-def _beside_others(task: Task) -> Scenario:
-    """Fig. 6."""
-    return _avoiding(task, ArmAvoidance(Sphere(FIG_6_PLACES[task.name], FIG_6_DIAMETER)))
-
-
 def _comparison(name: str, title: str, task: str) -> PaperScene:
     """Return a scene of ours beside other methods (fig. 6)."""
     line = "Ours is orange. Scores and curves of all are in “Compare”; drag the sphere."
-    return PaperScene(name, f"Fig. 6: {title}", line, task, _beside_others, view=FIG_6)
+    avoidance = ArmAvoidance(Sphere(FIG_6_PLACES[task], FIG_6_DIAMETER))
+    return PaperScene(name, f"Fig. 6: {title}", line, task, lambda task: _avoiding(task, avoidance), view=FIG_6)
 
 
-def _into_pot(index: int) -> Callable[[Task], Scenario]:
-    """Fig. 8."""
-
-    def scenario(task: Task) -> Scenario:
-        return _biased(task, BiasPoint(release(task.pots[index]), moves_goal=True))
-
-    return scenario
+def _into_pot(name: str, index: int) -> PaperScene:
+    """Return a scene of a goal that is taken along to another pot (fig. 8)."""
+    return PaperScene(
+        f"{name}_pot",
+        f"Fig. 8: into the {name} pot",
+        f"One bias point takes the goal along from the centre pot to the {name} one. "
+        "Pale arms: from the starting pose on.",
+        "drop_pots",
+        lambda task: _biased(task, BiasPoint(release(task.pots[index]), moves_goal=True)),
+        view=POSES,
+    )
 
 
 SCENES: Mapping[str, PaperScene] = {
@@ -234,7 +224,7 @@ SCENES: Mapping[str, PaperScene] = {
             "Each step is a diffeomorphism on the one before it: straight motions, the S, the S around the sphere. "
             "Drag the sphere.",
             "draw_s",
-            _sphere_in_the_letter,
+            _sphere_in_the_letter(0.15),
             view=FIGURE | {"panels": (BASE_PANEL, Panel(IMITATION))},
         ),
         PaperScene(
@@ -280,7 +270,7 @@ SCENES: Mapping[str, PaperScene] = {
             "An 8 crosses itself. Motions of one field never do (left). One that remembers how far it is does: drag "
             "the sphere.",
             "draw_8",
-            _sphere_in_the_8,
+            _sphere_in_the_letter(0.09),  # small, so that the 8 remains one
             view=FIGURE
             | {"panels": (Panel(task="draw_8", state="plain"),), "streamlines": False, "demonstrations": True},
         ),
@@ -290,7 +280,7 @@ SCENES: Mapping[str, PaperScene] = {
             "Two hands draw an S (left). What leads from the one to the other is put on the C of the first: "
             "Stack → Amount.",
             "draw_c",
-            _in_style,
+            lambda task: replace(_alone(task), style="wavy"),
             view=FIGURE
             | {
                 "panels": (Panel(task="draw_s", state="augmented"), Panel(task="draw_s_wavy", state="augmented")),
@@ -308,24 +298,8 @@ SCENES: Mapping[str, PaperScene] = {
             _alone,
             view=POSES,
         ),
-        PaperScene(
-            "left_pot",
-            "Fig. 8: into the left pot",
-            "One bias point takes the goal along from the centre pot to the left one. "
-            "Pale arms: from the starting pose on.",
-            "drop_pots",
-            _into_pot(0),
-            view=POSES,
-        ),
-        PaperScene(
-            "right_pot",
-            "Fig. 8: into the right pot",
-            "One bias point takes the goal along from the centre pot to the right one. "
-            "Pale arms: from the starting pose on.",
-            "drop_pots",
-            _into_pot(2),
-            view=POSES,
-        ),
+        _into_pot("left", 0),
+        _into_pot("right", 2),
     )
 }
 """Scenes by name, in the order of the figures; see `offered`."""
@@ -334,9 +308,3 @@ SCENES: Mapping[str, PaperScene] = {
 def offered(tasks: Container[str]) -> tuple[PaperScene, ...]:
     """Return the scenes whose tasks are all among these: those of the LASA data only where the user has them."""
     return tuple(scene for scene in SCENES.values() if all(name in tasks for name in scene.tasks))
-
-
-@lru_cache(maxsize=64)
-def _own(name: str, task: Task) -> Scenario:
-    """Return the scenario of a scene; a page asks for it with each frame."""
-    return SCENES[name].scenario(task)

@@ -14,7 +14,7 @@ from dt_viz.avoidance.transform import Anchored, Transform
 from dt_viz.metrics import resample_by_arc_length
 from dt_viz.obstacles.shapes import Point, as_point
 from dt_viz.scenario.panels import BASE_PANEL, Panel
-from dt_viz.scenario.scenario import Layer, Scenario, View
+from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.tasks import Task
 
 IMITATION, WHOLE_ARM = "Imitation", "Whole arm"
@@ -116,12 +116,6 @@ def listed(scenario: Scenario) -> tuple[str, ...]:
 def levels(scenario: Scenario) -> tuple[str, ...]:
     """Names of the levels of the end effector's stack that are on, as `Frame.levels` has them."""
     return (IMITATION, *(layer.name for _, layer in scenario.active))
-
-
-def level_of(scenario: Scenario, view: View) -> int | None:
-    """Index in `levels` of the one that a view names; None where that is not in the stack."""
-    names = levels(scenario)
-    return names.index(view.level) if view.level in names else None
 
 
 def side_by_side(scenario: Scenario) -> tuple[Panel, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -53,16 +54,15 @@ def struck(area: Slice, origin: Array, direction: Array) -> Array | None:
 
 def with_start(scenario: Scenario, place: Array) -> tuple[Start, ...]:
     """Return the scenario's starts with one more at `place` (3,), metres, if there is room for it."""
-    taken = len(scenario.starts) >= MAX_STARTS or _is_taken(scenario.starts, place)
-    return scenario.starts if taken else (*scenario.starts, _new(scenario, place))
+    taken = any(np.linalg.norm(place - np.array(start.place)) < APART for start in scenario.starts)
+    if taken or len(scenario.starts) >= MAX_STARTS:
+        return scenario.starts
+    return (*scenario.starts, Start(as_point(place), scenario.view.start_label))
 
 
 def with_moved_start(scenario: Scenario, index: int, place: Array) -> tuple[Start, ...]:
     """Return the scenario's starts with one of them moved to `place` (3,), metres; unchanged if it was removed."""
-    starts = list(scenario.starts)
-    if index < len(starts):
-        starts[index] = replace(starts[index], place=as_point(place))
-    return tuple(starts)
+    return _changed(scenario, index, place=as_point(place))
 
 
 def with_grid(scenario: Scenario, area: Slice, arm_room: Callable[[Array], Array]) -> Grid:
@@ -75,19 +75,15 @@ def with_grid(scenario: Scenario, area: Slice, arm_room: Callable[[Array], Array
             whole arm avoids them.
     """
     u, v = (np.linspace(-INNER * half, INNER * half, num) for half, num in zip(area.half_size, (4, 4), strict=True))
-    starts, blocked, far = scenario.starts, 0, 0
     places = area.at(np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2))
     rooms = scenario.obstacle.signed_distance(places)
     if scenario.arm_avoidance is not None:
         rooms = np.minimum(rooms, arm_room(places))
-    for place, room in zip(places, rooms, strict=True):
-        if room < scenario.avoidance.margin:
-            blocked += 1
-        elif place[2] < 0.02 or np.linalg.norm(place - np.array(SHOULDER)) > REACH:
-            far += 1
-        elif len(starts) < MAX_STARTS and not _is_taken(starts, place):
-            starts = (*starts, _new(scenario, place))
-    return Grid(starts, blocked, far)
+    blocked = rooms < scenario.avoidance.margin
+    far = ~blocked & ((places[:, 2] < 0.02) | (np.linalg.norm(places - np.array(SHOULDER), axis=1) > REACH))
+    for place in places[~blocked & ~far]:
+        scenario = replace(scenario, starts=with_start(scenario, place))
+    return Grid(scenario.starts, int(blocked.sum()), int(far.sum()))
 
 
 def followed(scenario: Scenario, task: Task) -> int:
@@ -97,10 +93,7 @@ def followed(scenario: Scenario, task: Task) -> int:
 
 def with_label(scenario: Scenario, task: Task, label: float | None) -> tuple[Start, ...]:
     """Return the scenario's starts with a label on the one that the arm follows; unchanged if that is demonstrated."""
-    starts, index = list(scenario.starts), followed(scenario, task) - len(task.starts)
-    if index >= 0:
-        starts[index] = replace(starts[index], label=label)
-    return tuple(starts)
+    return _changed(scenario, followed(scenario, task) - len(task.starts), label=label)
 
 
 def label_of(scenario: Scenario, task: Task) -> float | None:
@@ -109,9 +102,5 @@ def label_of(scenario: Scenario, task: Task) -> float | None:
     return scenario.starts[index].label if index >= 0 else scenario.view.start_label
 
 
-def _new(scenario: Scenario, place: Array) -> Start:
-    return Start(as_point(place), scenario.view.start_label)
-
-
-def _is_taken(starts: tuple[Start, ...], place: Array) -> bool:
-    return any(np.linalg.norm(place - np.array(start.place)) < APART for start in starts)
+def _changed(scenario: Scenario, index: int, **changes: Any) -> tuple[Start, ...]:  # noqa: ANN401 - the fields of Start
+    return tuple(replace(start, **changes) if k == index else start for k, start in enumerate(scenario.starts))

@@ -14,6 +14,8 @@ from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.demonstrations import Demonstration, DemonstrationError, lasa_files, load_demonstrations
 from dt_viz.learning.interface import AnyImitation
 from dt_viz.metrics import resample_by_arc_length
+from dt_viz.numerics import unit
+from dt_viz.obstacles.shapes import as_point
 from dt_viz.scenario.objects import Ball, LiftedBox, Pot, PushedBox, TaskObject
 from dt_viz.scenario.slices import Slice
 from dt_viz.shipped import ASSETS
@@ -109,13 +111,11 @@ def letter(character: str, hint: str = "Drag the sphere through the letter.", ob
 def lift_box() -> Task:
     """Reach into a box, then lift abruptly (sec. 5)."""
     demonstrations = load_demonstrations(ASSETS / "lift_box.npz")
-    points = np.concatenate([d.positions for d in demonstrations])
-    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    lower, upper = _bounds(demonstrations)
+    middle = (lower + upper) / 2
     # the slice follows the motion: from the mean start towards the corner in the box, and up
-    along = np.array([0.0, -0.55, 0.0]) - np.mean([d.positions[0] for d in demonstrations], axis=0) * np.array(
-        [1.0, 1.0, 0.0]
-    )
-    along /= np.linalg.norm(along)
+    start = np.mean([d.positions[0] for d in demonstrations], axis=0)
+    along = unit(np.array([-start[0], -0.55 - start[1], 0.0]))
     lowest = np.mean([d.positions[d.positions[:, 2].argmin()] for d in demonstrations], axis=0)
     return Task(
         name="lift_box",
@@ -124,7 +124,7 @@ def lift_box() -> Task:
         demonstrations=demonstrations,
         slice=Slice(middle + np.array([0.0, 0.0, 0.02]), np.stack([along, [0.0, 0.0, 1.0]], axis=1), (0.32, 0.26)),
         camera=((0.98, -1.60, 0.92), (0.24, -0.33, 0.28)),
-        obstacle_position=_on_mean_path(demonstrations, lambda u: u, 0.42),
+        obstacle_position=as_point(_mean(demonstrations)[42]),
         objects=(LiftedBox((float(lowest[0]), float(lowest[1])), float(lowest[2])),),
     )
 
@@ -132,11 +132,10 @@ def lift_box() -> Task:
 def push_box() -> Task:
     """Come down behind a box and push it along the table (sec. 5)."""
     demonstrations = load_demonstrations(ASSETS / "push_box.npz")
-    points = np.concatenate([d.positions for d in demonstrations])
-    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    lower, upper = _bounds(demonstrations)
+    middle = (lower + upper) / 2
     height = demonstrations[0].positions[-1, 2]  # of the push: the slice lies level in it
-    x, y, z = _on_mean_path(demonstrations, lambda u: u, 0.55)
-    down, goal = (np.array(_on_mean_path(demonstrations, lambda u: u, u))[:2] for u in (0.35, 1.0))
+    mean = _mean(demonstrations)
     return Task(
         name="push_box",
         title="Push box",
@@ -144,8 +143,8 @@ def push_box() -> Task:
         demonstrations=demonstrations,
         slice=Slice(np.array([middle[0], middle[1], height]), np.eye(3)[:, :2], (0.42, 0.20)),
         camera=((0.70, -1.58, 0.95), (0.13, -0.32, 0.22)),
-        obstacle_position=(x, y, z - 0.02),  # a little low: the way over it is free, under it is the table
-        objects=(PushedBox.before(down, goal),),
+        obstacle_position=as_point(mean[55] - [0.0, 0.0, 0.02]),  # low: the way over it is free, under it is the table
+        objects=(PushedBox.before(mean[35, :2], mean[-1, :2]),),
     )
 
 
@@ -154,8 +153,8 @@ def drop_pots() -> Task:
     demonstrations = load_demonstrations(ASSETS / "drop_pots.npz")
     paths = np.stack([resample_by_arc_length(d.positions, 101) for d in demonstrations])
     # the slice is tilted: from the mean start down to the goals above all three pots
-    down = paths[:, -1].mean(axis=0) - paths[:, 0].mean(axis=0)
-    down = np.array([0.0, down[1], down[2]]) / np.hypot(down[1], down[2])
+    _, y, z = paths[:, -1].mean(axis=0) - paths[:, 0].mean(axis=0)
+    down = unit(np.array([0.0, y, z]))
     return Task(
         name="drop_pots",
         title="Drop in pots",
@@ -183,12 +182,11 @@ def drawing_task(
         demonstrations: demonstrations of one drawing.
         obstacle_at: first place of the obstacle on the mean drawing, as a fraction of its length.
     """
-    points = np.concatenate([d.positions for d in demonstrations])
-    lower, upper = points.min(axis=0), points.max(axis=0)
+    lower, upper = _bounds(demonstrations)
     size = float((upper - lower).max())
     scale = 1.0 if DRAWING_SIZE / 2 <= size <= 1.1 * DRAWING_SIZE else DRAWING_SIZE / size
     origin = DRAWING_CENTRE - scale * DRAWING_AXES[:, :2] @ ((lower + upper) / 2)
-    half = scale * (upper - lower) / 2 + 0.10
+    half, middle = scale * (upper - lower) / 2 + 0.10, _mean(demonstrations)[round(100 * obstacle_at)]
     return Task(
         name=name,
         title=title,
@@ -199,9 +197,7 @@ def drawing_task(
         scale=scale,
         slice=Slice(DRAWING_CENTRE, DRAWING_AXES[:, :2], (float(half[0]), float(half[1]))),
         camera=((0.79, -1.56, 0.75), (0.15, -0.33, 0.355)),
-        obstacle_position=_on_mean_path(
-            demonstrations, lambda u: origin + scale * u @ DRAWING_AXES[:, :2].T, obstacle_at
-        ),
+        obstacle_position=as_point(origin + scale * DRAWING_AXES[:, :2] @ middle),
         draws=True,
     )
 
@@ -234,13 +230,15 @@ def _lasa_task(name: str, path: Path) -> Task:
     return drawing_task(name, f"LASA {name}", "Drag the sphere through the letter.", demonstrations)
 
 
-def _on_mean_path(
-    demonstrations: tuple[Demonstration, ...], to_world: Callable[[Array], Array], fraction: float
-) -> tuple[float, float, float]:
-    """Return the world point at a fraction of the length of the mean demonstration."""
-    mean = np.mean([resample_by_arc_length(d.positions, 101) for d in demonstrations], axis=0)
-    x, y, z = to_world(mean[round(100 * fraction)])
-    return float(x), float(y), float(z)
+def _bounds(demonstrations: tuple[Demonstration, ...]) -> tuple[Array, Array]:
+    """Smallest and largest coordinates (k,) of the demonstrations."""
+    points = np.concatenate([d.positions for d in demonstrations])
+    return points.min(axis=0), points.max(axis=0)
+
+
+def _mean(demonstrations: tuple[Demonstration, ...]) -> Array:
+    """The mean demonstration (101, k) by arc length."""
+    return np.mean([resample_by_arc_length(d.positions, 101) for d in demonstrations], axis=0)
 
 
 TASKS: Mapping[str, TaskEntry] = {

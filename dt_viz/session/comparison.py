@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -42,10 +42,6 @@ class _Record:
     """Without curves and arm; None until its motions are planned."""
     is_complete: bool = False
     """Whether nothing is left to work out."""
-    curves: dict[int, Array] = field(default_factory=dict)
-    """Those of `Compared`, by the rollout."""
-    arms: dict[int, ArmMotion] = field(default_factory=dict)
-    """Motions of the arm, by the rollout that they follow."""
 
 
 def _around(method: Method, learned: Learned, frame: Frame) -> tuple[Hashable, ...]:
@@ -70,9 +66,6 @@ class Comparison:
             learned: its task, learned.
             notes: what is said of methods, by their names, while they are not planned.
         """
-        for method in _chosen(frame):
-            if method.live:
-                self._plan(method, frame, learned)
         return tuple(
             self._compared(method, frame, learned, (notes or {}).get(method.name, WAITS)) for method in _chosen(frame)
         )
@@ -115,17 +108,17 @@ class Comparison:
 
     def _compared(self, method: Method, frame: Frame, learned: Learned, waiting: str) -> Compared:
         """What is known of a method; `waiting` is its note while its motions are not."""
+        if method.live:
+            self._plan(method, frame, learned)
         record = self._record(method, learned, frame)
         known = record.known or Compared(method, note=waiting)
+        if not known.paths:
+            return known
         rollout = frame.chosen if frame.chosen is not None and frame.chosen < len(learned.task.starts) else 0
-        if known.paths and rollout not in record.curves:
-            path, demonstration = known.paths[rollout], learned.task.paths[rollout]
-            record.curves[rollout] = curves(path, demonstration, frame.scenario.obstacle)
-        shows_arm = frame.scenario.view.their_arm == method.name
-        if shows_arm and rollout not in record.arms and known.times and len(known.times[rollout]) > 1:
-            record.arms[rollout] = self._arm(known, learned, rollout)
-        arm = record.arms.get(rollout) if shows_arm else None
-        return replace(known, rollout=rollout, curves=record.curves.get(rollout), arm=arm)
+        shows_arm = frame.scenario.view.their_arm == method.name and len(known.times[rollout]) > 1
+        arm = self._arm(record, learned, rollout) if shows_arm else None
+        path, demonstration = known.paths[rollout], learned.task.paths[rollout]
+        return replace(known, rollout=rollout, curves=curves(path, demonstration, frame.scenario.obstacle), arm=arm)
 
     def _plan(self, method: Method, frame: Frame, learned: Learned, cancelled: Cancelled = never) -> None:
         """Plan a method's motions unless they are known; those that do not avoid are the same around all obstacles."""
@@ -165,8 +158,11 @@ class Comparison:
     def _problem(self, learned: Learned) -> Problem:
         return problem_of(learned, self._follower)
 
-    def _arm(self, known: Compared, learned: Learned, rollout: int) -> ArmMotion:
-        """The arm's motion along a rollout of a method."""
+    @kept(NEWEST, by=lambda record, _, rollout: (record, rollout))
+    def _arm(self, record: _Record, learned: Learned, rollout: int) -> ArmMotion:
+        """The arm's motion along a rollout of a method whose motions are planned."""
+        known = record.known
+        assert known is not None
         q, times = self._joints(known, learned, rollout), known.times[rollout]
         if known.joints is None:
             times = times[_tracked(len(times))]
@@ -182,24 +178,16 @@ class Comparison:
 
     def _arm_depth(self, known: Compared, frame: Frame, learned: Learned, cancelled: Cancelled) -> float | None:
         """How deep the arm's meshes enter the obstacle along motions, metres; None where it cannot follow."""
+        model, depth, ours = load_collision_model(), 0.0, known.method is OURS
         try:
-            if known.method is OURS:
-                moving = np.flatnonzero(frame.motion.nominal.moving).tolist()
-                joints = [arm_along(frame, place, self._follower)[0].q for place in moving]
-            else:
-                joints = [self._joints(known, learned, k) for k in range(len(known.paths))]
+            moving = np.flatnonzero(frame.motion.nominal.moving).tolist()
+            for k in moving if ours else range(len(known.paths)):
+                end_if(cancelled)
+                q = arm_along(frame, k, self._follower)[0].q if ours else self._joints(known, learned, k)
+                depth = max(depth, -model.nearest_to_obstacle(q, frame.scenario.obstacle).distance)
         except UnreachableError:
             return None
-        return _deepest(joints, frame.scenario.obstacle, cancelled)
-
-
-def _deepest(joints: list[Array], obstacle: Union, cancelled: Cancelled) -> float:
-    """How deep the arm's meshes enter an obstacle along postures (N_i, 6), rad, metres; 0 when they are clear."""
-    model, depth = load_collision_model(), 0.0
-    for q in joints:
-        end_if(cancelled)
-        depth = max(depth, -model.nearest_to_obstacle(q, obstacle).distance)
-    return depth
+        return depth
 
 
 def scored(paths: tuple[Array, ...], task: Task, goal: Array, obstacle: Union) -> Scores:

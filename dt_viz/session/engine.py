@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from dt_viz.avoidance.avoidance import Avoidance
-from dt_viz.avoidance.transform import Transform
 from dt_viz.errors import Cancelled, never
 from dt_viz.learning.augmented import AugmentedImitation, fit_augmented
 from dt_viz.learning.imitation import ImitationSettings, Progress
@@ -69,8 +67,6 @@ class Engine:
         self._drawing = Drawing(self.follower, self.memo)
         self._last: dict[str, Solved] = {}
         """The last motion of each task: what is shown where a scenario has none."""
-        self._seconds = 0.0
-        """Time that the frames of a scenario have taken so far, seconds."""
 
     def task(self, name: str) -> Task:
         """The task of that name, which all engines share; any thread may ask for it.
@@ -98,30 +94,20 @@ class Engine:
         self.nominal(scenario, progress)
         others = {panel.shown: Scenario(panel.task, state=panel.state) for panel in scenario.view.panels if panel.shown}
         learned = {panel: self.nominal(other, progress).learned for panel, other in others.items()}
-        self._seconds, began = 0.0, time.perf_counter()
-        for frame in self._stages(scenario, learned, cancelled):
-            self._seconds += time.perf_counter() - began
-            yield replace(frame, seconds=self._seconds)
-            began = time.perf_counter()
-
-    def _stages(self, scenario: Scenario, others: Mapping[Panel, Learned], cancelled: Cancelled) -> Iterator[Frame]:
         with _cores.slot():
             frame = self._rollouts(scenario, LIVE)
         yield frame
         with _cores.slot():
-            frame = self._seen(frame, Stage.LIVE, others)
+            frame = self._seen(frame, Stage.LIVE, learned)
         yield frame
         with _cores.slot(cancelled):
             frame = self._rollouts(scenario, FINE)
         with _cores.slot(cancelled):
-            frame = self._seen(frame, Stage.FINE, others)
+            frame = self._seen(frame, Stage.FINE, learned)
         yield frame
         frame = replace(frame, stage=Stage.CERTIFIED)
         if not frame.blocked:
-            with _cores.slot(cancelled):
-                frame = replace(frame, certificates=self._certified(frame))
-            with _cores.slot(cancelled):
-                frame = replace(frame, certificates=self._with_meshes(frame))
+            frame = replace(frame, certificates=self._certified(frame, cancelled))
         yield frame
         if frame.motion.arm is not None and not frame.blocked:
             with _cores.slot(cancelled):
@@ -264,13 +250,12 @@ class Engine:
             return None, (unreachable(error),)
         return arm, (*warnings, *far_starts(far, nominal.added))
 
-    @kept(1, by=lambda frame: (frame.motion, frame.chosen))
-    def _certified(self, frame: Frame) -> Certificates:
-        return certify(frame, self.follower)
-
-    @kept(1, by=lambda frame: (frame.motion, frame.chosen))
-    def _with_meshes(self, frame: Frame) -> Certificates:
-        return with_meshes(frame)
+    @kept(1, by=lambda frame, _: (frame.motion, frame.chosen))
+    def _certified(self, frame: Frame, cancelled: Cancelled) -> Certificates:
+        with _cores.slot(cancelled):
+            known = certify(frame, self.follower)
+        with _cores.slot(cancelled):
+            return with_meshes(replace(frame, certificates=known))
 
     def _compared(self, frame: Frame, notes: Mapping[str, str] | None = None) -> Frame:
         """The frame with other methods beside ours, as far as they are known; `notes` see `Comparison.of`."""
@@ -306,20 +291,14 @@ class Engine:
 
         Where that is blocked it stays with the motion that is shown, and gives way to what is in its way now.
         """
-        began, motion = time.perf_counter(), frame.motion
-        if frame.blocked:
-            motion = replace(motion, scenario=frame.scenario.motion)
+        motion = replace(frame.motion, scenario=frame.scenario.motion) if frame.blocked else frame.motion
         try:
             self.arm.follow(motion, frame.chosen)
         except UnreachableError:
             self.arm.stop()
-        self._seconds += time.perf_counter() - began
 
 
 def _without_obstacles(stack: tuple[Layer, ...]) -> tuple[Layer, ...]:
     """The stack with all that avoids switched off."""
-    return tuple(replace(layer, on=layer.on and not _avoids(layer.transform)) for layer in stack)
-
-
-def _avoids(transform: Transform) -> bool:
-    return isinstance(transform, Avoidance) or bool(transform.avoided.parts)
+    avoids = [isinstance(layer.transform, Avoidance) or bool(layer.transform.avoided.parts) for layer in stack]
+    return tuple(replace(layer, on=layer.on and not off) for layer, off in zip(stack, avoids, strict=True))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
 
@@ -21,8 +21,7 @@ from dt_viz.motion.stack import Applied
 from dt_viz.pictures.sketchbook import NO_PICTURES, Pictures, in_frame
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.slices import Slice
-from dt_viz.scenario.stack import level_of
-from dt_viz.scenario.starts import followed
+from dt_viz.scenario.stack import levels
 from dt_viz.scenario.tasks import Task
 from dt_viz.warning import MotionWarning
 
@@ -99,8 +98,6 @@ class Frame:
     """Along the rollout that the arm follows; None before stage FINE, and where the view does not show them."""
     comparison: tuple[Compared, ...] = ()
     """Ours and the methods beside it, as far as the view shows any; none before stage LIVE."""
-    seconds: float = 0.0
-    """Time that it took to compute, with the frames before it and what the robot was given, without waits, seconds."""
 
     @property
     def task(self) -> Task:
@@ -136,7 +133,8 @@ class Frame:
     @property
     def level(self) -> int | None:
         """Index in `levels` of the manifold that the view and the pictures show; None is the top of the stack."""
-        return level_of(self.motion.scenario, self.scenario.view)
+        names, level = levels(self.motion.scenario), self.scenario.view.level
+        return names.index(level) if level in names else None
 
     @property
     def goal(self) -> Array:
@@ -160,7 +158,7 @@ class Frame:
         The first one that there is where it cannot begin the one that is asked for; None where that is an added one.
         """
         nominal, scenario = self.motion.nominal, self.motion.scenario
-        place = followed(replace(scenario, arm_rollout=self.scenario.arm_rollout), self.task)
+        place = self.scenario.arm_rollout % (len(self.task.starts) + len(scenario.starts))
         if nominal.moving[place]:
             return place
         return None if nominal.added[place] else int(np.argmax(nominal.moving))

@@ -27,7 +27,8 @@ class Jobs:
         self._changed = threading.Condition()
         self._lanes: dict[str, deque[Work]] = {}
         """Work that waits, of each lane that has a thread."""
-        self._closed = False
+        self.closed = False
+        """Whether the visitor has left."""
 
     def submit(self, lane: str, work: Work, *, latest: bool = False) -> int:
         """Do work on a lane, after what it is doing; nothing is done once the visitor has left. Never blocks for long.
@@ -41,7 +42,7 @@ class Jobs:
             Number of the works that were dropped.
         """
         with self._changed:
-            if self._closed:  # a control that still moves while its page goes away
+            if self.closed:  # a control that still moves while its page goes away
                 return 0
             dropped = self._drop(lane) if latest else 0
             if lane in self._lanes:
@@ -59,7 +60,7 @@ class Jobs:
 
     def superseded(self, lane: str) -> bool:
         """Return whether newer work waits on a lane, or the visitor has left."""
-        return self._closed or bool(self._lanes.get(lane))
+        return self.closed or bool(self._lanes.get(lane))
 
     def rest(self, lane: str, seconds: float) -> None:
         """Pause the work of a lane, which calls this, for so long or until it is superseded."""
@@ -74,7 +75,7 @@ class Jobs:
     def close(self) -> None:
         """Drop what waits: the visitor has left. What runs is not waited for."""
         with self._changed:
-            self._closed = True
+            self.closed = True
             for lane in self._lanes:
                 self._drop(lane)
             self._changed.notify_all()
@@ -99,7 +100,7 @@ class Jobs:
             except UnwantedError:
                 pass
             except Exception as error:  # the one place where whatever work raises is caught: the page goes on
-                if not self._closed:
+                if not self.closed:
                     logger.exception("%s failed", lane)
                     self._report(lane, error)
 

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.session.frame import Frame, Stage
 from dt_viz.warning import Severity
+
+LIVE_PAUSE, LIVE_LATENCIES = 0.05, 2.0
+"""Shortest time between two drawings of the field while edits come faster, in seconds and in latencies of the rollouts:
+these are drawn more often, the more so the longer they take."""
 
 
 @dataclass(frozen=True)
@@ -73,3 +82,58 @@ class Display(Protocol):
 
     def tell(self, progress: Progress) -> None:
         """Show how what is shown relates to what is wanted: after each change of one of them."""
+
+
+class Screen:
+    """A display and what it shows: one thread after the other, so that the newest is shown last."""
+
+    def __init__(self, display: Display, wanted: Scenario) -> None:
+        """Take the display; nothing is shown on it yet."""
+        self._display = display
+        self._adopting, self._telling = threading.RLock(), threading.RLock()
+        self.progress = Progress(wanted)
+        self._pace = self.progress.pace
+        """Of the newest frame."""
+        self._learned = -math.inf
+        """Time of the newest news of learning, of `time.perf_counter`."""
+        self._live_frames: deque[float] = deque(maxlen=120)
+        """Times of the newest frames of stage LIVE, of `time.perf_counter`."""
+
+    def adopt(self, newest: Callable[[], Scenario]) -> None:
+        """Show the newest scenario, asked for in its turn, on the controls: it is wanted now."""
+        with self._adopting:
+            wanted = newest()
+            self._display.adopt(wanted)
+            self.tell(wanted=wanted)
+
+    def tell(self, **changes: Any) -> None:  # noqa: ANN401 - the fields of Progress
+        """Change the progress and show it."""
+        with self._telling:
+            if changes.get("learning") is not None:
+                self._learned = time.perf_counter()
+            self.progress = replace(self.progress, **changes)
+            self._display.tell(self.progress)
+
+    def say(self, text: str, severity: Severity, wanted: Scenario) -> None:
+        """Show a message while a scenario is wanted."""
+        self.tell(message=Message(text, severity, wanted))
+
+    def draw(self, frame: Frame, edited: float, num_skipped: int) -> None:
+        """Show a frame whose scenario was asked for at a time, of `time.perf_counter`; learning is no rebuild."""
+        now = time.perf_counter()
+        latency = now - max(edited, self._learned)
+        if frame.stage is Stage.LIVE:
+            self._live_frames.append(now)
+        rate = sum(now - t <= 1.0 for t in self._live_frames)
+        self._pace = Pace(latency if frame.stage <= Stage.LIVE else self._pace.latency, rate, num_skipped)
+        self._display.draw(frame, self._pace)
+        if frame.stage is not Stage.ROLLOUTS:  # the next stage is a few milliseconds away
+            with self._telling:
+                message = self.progress.message
+                kept = message if message is not None and message.scenario == frame.scenario else None
+                self.tell(shown=frame, pace=self._pace, learning=None, failed=False, message=kept)
+
+    def live_pause(self) -> float:
+        """Time until the field is due to be drawn again, seconds."""
+        last = self._live_frames[-1] if self._live_frames else -math.inf
+        return last + max(LIVE_PAUSE, LIVE_LATENCIES * self._pace.latency) - time.perf_counter()

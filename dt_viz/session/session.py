@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import logging
-import math
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -20,25 +18,20 @@ from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import IMITATION, as_fresh
 from dt_viz.scenario.tasks import Task
 from dt_viz.session.engine import Engine
-from dt_viz.session.frame import Stage
+from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.history import History
 from dt_viz.session.jobs import Jobs
-from dt_viz.session.progress import Display, Message, Pace, Progress
+from dt_viz.session.progress import Display, Screen
 from dt_viz.warning import Severity
 
 logger = logging.getLogger(__name__)
 
-LIVE_PAUSE, LIVE_LATENCIES = 0.05, 2.0
-"""Shortest time between two drawings of the field while edits come faster, in seconds and in latencies of the rollouts:
-these are drawn more often, the more so the longer they take."""
 HABITS = ("playing", "replay", "speed", "joint_plots", "health_plots")
 """Fields of the view that are a visitor's way of working, and stay when a scene of the paper comes or goes."""
 REST = 0.1
 """Time that a scenario must rest before it is refined, seconds: while a hand moves, edits come faster."""
 LANE = "session"
 """Lane of the jobs on which the newest scenario is computed."""
-_Job = tuple[Scenario, float]
-"""A scenario to compute, and when it was asked for, seconds."""
 
 
 def _with_a_level_of_its_own(scenario: Scenario) -> Scenario:
@@ -63,22 +56,18 @@ class Session:
         """
         self._engine = engine
         self._initial = initial
-        self._display = display
         self._lock = threading.Lock()
-        self._adopting = threading.RLock()
         self.scenario = initial(task)
+        self._screen = Screen(display, self.scenario)
         self._history = History()
         self._unadopted = False
         """Whether the scenario was edited by a drag and is not shown on the controls yet."""
-        self._stopped = self._closed = False
-        self._telling = threading.RLock()
-        self._progress = Progress(self.scenario)
-        self._shown: Scenario | None = None
-        self._passing = ANEW
-        """How the motions that are shown pass the obstacles."""
-        self._latency = 0.0
-        self._live_frames: deque[float] = deque(maxlen=120)
+        self._stopped = False
+        """Whether the learning of the scenario was cancelled, and there is no other to go back to."""
+        self._shown: Frame | None = None
+        """The newest frame; None before the first one."""
         self._num_skipped = 0
+        """Edits that a newer one overtook."""
         self.jobs = Jobs(self.fail)
         """All work of the visitor beside the server's event loop."""
         self._adopt()
@@ -99,7 +88,7 @@ class Session:
         """
         with self._lock:
             edited = _with_a_level_of_its_own(replace(self.scenario, **changes))
-            failed = self._progress.failed
+            failed = self._screen.progress.failed
             if edited == self.scenario and not failed:
                 return
             if edited.full != self.scenario.full:
@@ -145,14 +134,8 @@ class Session:
             if self.scenario.scene:  # of the paper: leaves nothing behind
                 self._begin("task", self._as_seen(fresh))
                 return
-            self.step(
-                "task",
-                task=name,
-                arm_rollout=0,
-                starts=fresh.starts,
-                stack=as_fresh(self.scenario, fresh),
-                view=replace(self.scenario.view, slice=None),
-            )
+            stack, view = as_fresh(self.scenario, fresh), replace(self.scenario.view, slice=None)
+            self.step("task", task=name, arm_rollout=0, starts=fresh.starts, stack=stack, view=view)
 
     def reset(self) -> None:
         """Back to how the task or the scene began, and was looked at; the motion's part of it can be undone."""
@@ -179,17 +162,15 @@ class Session:
     def _as_seen(self, other: Scenario) -> Scenario:
         """Another scenario, looked at as this one, on the slice that it had.
 
-        If it is of a scene of the paper that this is not of, or the other way round, it is looked at as it was itself.
+        If it is of a scene of the paper that this is not of, or the other way round, it is looked at as it was itself,
+        but for habits.
         """
-        if other.scene != self.scenario.scene:
-            return self._with_habits(other)
-        view = replace(self.scenario.view, slice=other.view.slice)
+        view = self.scenario.view
+        if other.scene == self.scenario.scene:
+            view = replace(view, slice=other.view.slice)
+        else:
+            view = replace(other.view, **{name: getattr(view, name) for name in HABITS})
         return _with_a_level_of_its_own(replace(other, view=view))
-
-    def _with_habits(self, other: Scenario) -> Scenario:
-        """Another scenario, looked at as it was itself, but for what stays whatever is shown."""
-        kept = {name: getattr(self.scenario.view, name) for name in HABITS}
-        return _with_a_level_of_its_own(replace(other, view=replace(other.view, **kept)))
 
     def undo(self) -> None:
         """Take the last gesture back."""
@@ -202,31 +183,31 @@ class Session:
     def cancel(self) -> None:
         """Stop learning a task and go back to what was shown before. Nothing is done while nothing is learned."""
         with self._lock:
-            abandoned = self.scenario
-            learning = self._progress.learning is not None
-            if not learning or (self._shown is not None and abandoned.fit == self._shown.fit):
+            abandoned, shown = self.scenario, self._shown
+            learning = self._screen.progress.learning is not None
+            if not learning or (shown is not None and abandoned.fit == shown.scenario.fit):
                 return
             self._stopped = not self._retreat(abandoned)
         self._adopt()
         instead = "Choose another task, or move the obstacle to start again."
-        if self._shown is not None:
+        if shown is not None:
             instead = f"This is “{self.task.title}” as before."
         title = self._engine.task(abandoned.task).title
-        self._tell(learning=None)
+        self._screen.tell(learning=None)
         self.say(f"Learning “{title}” was cancelled. {instead}", Severity.WARNING)
 
     def expect(self, expected: bool) -> None:
         """Take note that another task or scene is being read for this session, or no more."""
-        self._tell(expected=expected)
+        self._screen.tell(expected=expected)
 
     def say(self, text: str, severity: Severity) -> None:
         """Show a message until another scenario is shown."""
-        self._tell(message=Message(text, severity, self.scenario))
+        self._screen.say(text, severity, self.scenario)
 
     def fail(self, error: Exception) -> None:
         """Show what went wrong; what is shown stays."""
         expected = isinstance(error, DataError | ImitationError)
-        self._tell(failed=True, learning=None)
+        self._screen.tell(failed=True, learning=None)
         self.say(str(error) if expected else f"{type(error).__name__}: {error}", Severity.ALARM)
 
     def wait_idle(self, timeout: float | None = None) -> bool:
@@ -235,7 +216,6 @@ class Session:
 
     def close(self) -> None:
         """Stop computing and let go of everything."""
-        self._closed = True
         self.jobs.close()
 
     def _travel(self, moved: Callable[[Scenario], Scenario | None]) -> None:
@@ -248,17 +228,9 @@ class Session:
         self._adopt()
 
     def _adopt(self) -> None:
-        """Show the newest scenario on the controls: one thread after the other, so that the newest is shown last."""
-        with self._adopting:
-            self._unadopted = False
-            self._display.adopt(self.scenario)
-            self._tell(wanted=self.scenario)
-
-    def _tell(self, **changes: Any) -> None:  # noqa: ANN401 - the fields of Progress
-        """Change the progress and show it: one thread after the other, so that the newest is shown last."""
-        with self._telling:
-            self._progress = replace(self._progress, **changes)
-            self._display.tell(self._progress)
+        """Show the newest scenario on the controls."""
+        self._unadopted = False
+        self._screen.adopt(lambda: self.scenario)
 
     def _catch_up(self) -> None:
         """Show what a drag has edited."""
@@ -271,87 +243,72 @@ class Session:
         Called with the lock held. False if there is none, or if `abandoned` is not what is wanted any more.
         """
         shown = self._shown
-        if shown is None or shown.fit == abandoned.fit or self.scenario.fit != abandoned.fit:
+        if shown is None or shown.scenario.fit == abandoned.fit or self.scenario.fit != abandoned.fit:
             return False
-        self.scenario = self._as_seen(self._history.without(abandoned, shown))
+        self.scenario = self._as_seen(self._history.without(abandoned, shown.scenario))
         self._submit()
         return True
 
     def _submit(self) -> None:
         self._stopped = False
-        if self._progress.failed:
-            self._tell(failed=False)
+        if self._screen.progress.failed:
+            self._screen.tell(failed=False)
         self._engine.see(self.scenario)
-        compute = partial(self._compute, (self.scenario, time.perf_counter()))
+        compute = partial(self._compute, self.scenario, time.perf_counter())
         self._num_skipped += self.jobs.submit(LANE, compute, latest=True)
 
-    def _compute(self, job: _Job) -> None:
+    def _compute(self, scenario: Scenario, edited: float) -> None:
+        """Show the frames of a scenario that was wanted at a time, of `time.perf_counter`."""
         superseded = partial(self.jobs.superseded, LANE)
         try:
-            self._show_frames(job, superseded)
+            self._show_frames(self._decided(scenario), edited, superseded)
         except UnwantedError:
             raise
         except Exception as error:
             with self._lock:
-                self._tell(failed=True)
-                returned = isinstance(error, DataError | ImitationError) and self._retreat(job[0])
-                if not returned and self.scenario != job[0] and not superseded():
+                self._screen.tell(failed=True)
+                returned = isinstance(error, DataError | ImitationError) and self._retreat(scenario)
+                if not returned and self.scenario != scenario and not superseded():
                     self._submit()  # it was edited meanwhile, and seemed to need no frames of its own
             if returned:
                 self._adopt()
             raise
         finally:
-            if self._progress.learning is not None:
-                self._tell(learning=None)
+            if self._screen.progress.learning is not None:
+                self._screen.tell(learning=None)
 
     def _learn(self, scenario: Scenario, fraction: float, message: str) -> None:
         """Show how far learning is; end it when something else is to be learned, not when the obstacle moves."""
         with self._lock:
-            if self._stopped or self._closed or self.scenario.fit != scenario.fit:
+            if self._stopped or self.jobs.closed or self.scenario.fit != scenario.fit:
                 raise UnwantedError
-        self._tell(learning=(fraction, message))
+        self._screen.tell(learning=(fraction, message))
 
     def _decided(self, scenario: Scenario) -> Scenario:
         """The scenario with a passing: that of the motion that is shown, of the same fit, where none is decided yet."""
         if scenario.passing is not None:
             return scenario
-        alike = self._shown is not None and scenario.learned == self._shown.learned
-        passing = self._passing if alike else ANEW
+        shown = self._shown
+        passing = shown.passing if shown is not None and scenario.learned == shown.scenario.learned else ANEW
         with self._lock:
             if self.scenario.passing is None and self.scenario.full == scenario.full:
                 self.scenario = replace(self.scenario, passing=passing)
         return replace(scenario, passing=passing)
 
-    def _show_frames(self, job: _Job, superseded: Callable[[], bool]) -> None:
-        scenario, edited = self._decided(job[0]), job[1]
+    def _show_frames(self, scenario: Scenario, edited: float, superseded: Callable[[], bool]) -> None:
         self._catch_up()
         for frame in self._engine.frames(scenario, partial(self._learn, scenario), superseded):
-            now = time.perf_counter()
-            if self._progress.learning is not None:
-                edited = now - frame.seconds  # learning is no rebuild
-            drawn = self._shown is not None and scenario.choices == self._shown.choices
-            self._shown, self._passing = scenario, frame.passing
+            drawn = self._shown is not None and scenario.choices == self._shown.scenario.choices
+            self._shown = frame
             if frame.stage is Stage.ROLLOUTS and drawn:
                 continue  # it is only looked at in another way: the next stage is what changes
-            if frame.stage <= Stage.LIVE:
-                self._latency = now - edited
-            if frame.stage is Stage.LIVE:
-                self._live_frames.append(now)
-            rate = sum(now - t <= 1.0 for t in self._live_frames)
-            pace = Pace(self._latency, rate, self._num_skipped)
-            self._display.draw(frame, pace)
-            if frame.stage is not Stage.ROLLOUTS:  # the next stage is a few milliseconds away
-                with self._telling:
-                    message = self._progress.message
-                    kept = message if message is not None and message.scenario == scenario else None
-                    self._tell(shown=frame, pace=pace, learning=None, failed=False, message=kept)
+            self._screen.draw(frame, edited, self._num_skipped)
             if frame.stage in (Stage.ROLLOUTS, Stage.FINE):
                 self._engine.drive(frame)
             if frame.stage is Stage.LIVE:
                 self.jobs.rest(LANE, REST)
             elif frame.stage is Stage.ROLLOUTS:
-                last = self._live_frames[-1] if self._live_frames else -math.inf
-                pause = last + max(LIVE_PAUSE, LIVE_LATENCIES * self._latency) - now
+                pause = self._screen.live_pause()
                 if pause <= 0:
                     continue  # the field is due, whatever is waiting
                 self.jobs.rest(LANE, pause)

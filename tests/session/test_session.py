@@ -40,7 +40,6 @@ class Sketch:
     scenario: Scenario
     stage: Stage
     passing: Passing = field(default_factory=Passing, compare=False)
-    seconds: float = field(default=0.0, compare=False)
 
 
 class FakeEngine:

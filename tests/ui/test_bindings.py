@@ -106,12 +106,12 @@ def test_an_edit_leaves_alone_what_a_browser_has_moved_meanwhile(server, sent):
 
 def test_what_is_not_known_is_kept_until_a_frame_tells_it(server):
     bound, shown = Bound(SCENARIO), []
-    bound.show(lambda _s: KEEP if bound.frame is None else bound.frame.seconds, shown.append)
+    bound.show(lambda _s: KEEP if bound.frame is None else bound.frame.blocked, shown.append)
     bound.adopt(SCENARIO)
     assert shown == []
-    for seconds in (0.1, 0.1, 0.2):
-        bound.report(frame_of(SCENARIO, seconds=seconds))
-    assert shown == [0.1, 0.2]
+    for blocked in (("no way",), ("no way",), ()):
+        bound.report(frame_of(SCENARIO, blocked=blocked))
+    assert shown == [("no way",), ()]
 
 
 def test_what_is_assigned_is_shown_and_calls_nothing_back(server):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dt_viz.session.frame import Stage
-from dt_viz.session.session import Pace
+from dt_viz.session.progress import Pace
 from dt_viz.ui.scene.palette import DARK, Theme
 from dt_viz.ui.scene.style import STYLES
 
