@@ -90,10 +90,7 @@ def velocities(frame: Frame, learned: Array) -> Array:
     Places inside an obstacle have none, NaN. They are `learned` (M, 3), those of the learned motion, where the stack
     moves nothing.
     """
-    built = frame.motion.stack.built
-    if not built:
-        return learned
-    points = lattice(frame)
+    points, built = lattice(frame), frame.motion.stack.built
     free = _avoided(built).signed_distance(points) > 0
     stacked = Chain([Identity(3), *(applied.made.transform for applied in built)])
     spread = np.full_like(points, np.nan)
@@ -113,6 +110,13 @@ def _learned(frame: Frame) -> tuple[Hashable, ...]:
     """What the learned motion's arrows depend on."""
     motion = frame.motion
     return motion.below.learned, motion.stack.rays.base.goal.tobytes(), frame.scenario.view.slice, rest(frame).tobytes()
+
+
+def _stacked(frame: Frame) -> tuple[Hashable, ...]:
+    """What the arrows of the stack below the arm's avoidance depend on."""
+    motion, layers = frame.motion, tuple(layer for _, layer in frame.motion.scenario.active)
+    below = motion.below if layers or motion.scenario.warp < 1 else None
+    return *_learned(frame), below, layers, *motion.passing.hand.values()
 
 
 class Drawing:
@@ -155,8 +159,7 @@ class Drawing:
         motion, robot = frame.motion, self._follower.robot
         assert motion.arm is not None
         postures = self._postures(frame, self._follower.reference(motion.nominal))
-        hand = velocities(frame, self._learned_velocities(frame))
-        return postures.carried(hand, motion.arm.transform, robot, motion.scenario.obstacle)
+        return postures.carried(self._velocities(frame), motion.arm.transform, robot, motion.scenario.obstacle)
 
     @kept(NUM_BOOKS, by=lambda learned, at: (learned, at.tobytes()))
     def _book(self, learned: Learned, at: Array) -> Sketchbook:
@@ -169,6 +172,11 @@ class Drawing:
     def _postures(self, frame: Frame, near: Array) -> Lattice:
         """The postures that hold the hand at the lattice, `near` one (6,), rad."""
         return Lattice.of(lattice(frame), self._follower.robot, near)
+
+    @kept(2, by=_stacked)
+    def _velocities(self, frame: Frame) -> Array:
+        """See `velocities`."""
+        return velocities(frame, self._learned_velocities(frame))
 
     @kept(2, by=_learned)
     def _learned_velocities(self, frame: Frame) -> Array:
