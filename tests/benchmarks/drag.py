@@ -23,6 +23,7 @@ The npz file holds for each step, drag after drag:
 from __future__ import annotations
 
 import argparse
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -134,13 +135,13 @@ def _measured(engine: Engine, task: Task, places: Array, options: argparse.Names
     for place in places:
         avoidance = Avoidance(Sphere(as_point(place), options.diameter), space=SPACE[options.avoid])
         scenario = replace(avoiding(task, avoidance), view=View(field=False), passing=passing)
-        frames = engine.frames(scenario)
-        first = frame = next(frames)
+        frames, began = engine.frames(scenario), time.perf_counter()
+        frame = next(frames)
+        seconds.append(time.perf_counter() - began)
         while frame.stage < Stage.LIVE:
             frame = next(frames)
         passing = frame.passing
         blocked.append(bool(frame.blocked))
-        seconds.append(first.seconds)
         rollouts.append(rollouts[-1] if frame.blocked else _by_start(frame, task))
     return Drag(places, np.stack(rollouts[1:]), np.array(blocked), np.array(seconds))
 

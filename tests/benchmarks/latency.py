@@ -21,7 +21,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -50,6 +50,7 @@ from dt_viz.scenario.paper_scenes import bottle
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import anchored, plane_of, with_added, with_avoidance, with_transform
 from dt_viz.scenario.tasks import Task
+from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.progress import Display, Pace, Progress
 from dt_viz.session.session import Session
@@ -79,17 +80,33 @@ class Recorder(Display):
 
     frames: list[tuple[Stage, float, float]] = field(default_factory=list)
     """Stage, seconds from the edit until the frame was ready, and seconds of computing alone, of each frame."""
+    seconds: float = 0.0
+    """Time of computing the frame that is drawn, seconds; see `_timed`."""
     num_skipped: int = 0
     """Number of skipped edits since the session began."""
     error: str = ""
 
     def draw(self, frame: Frame, pace: Pace) -> None:
-        self.frames.append((frame.stage, pace.latency, frame.seconds))
+        self.frames.append((frame.stage, pace.latency, self.seconds))
         self.num_skipped = pace.num_skipped
 
     def tell(self, progress: Progress) -> None:
         if progress.failed and progress.message is not None:
             self.error = progress.message.text
+
+
+def _timed(engine: Engine, shown: Recorder) -> Engine:
+    """Return an engine that tells the recorder how long it computes."""
+    frames = engine.frames
+
+    def timed(*scenario: Any, **others: Any) -> Iterator[Frame]:
+        began = time.perf_counter()
+        for frame in frames(*scenario, **others):
+            shown.seconds = time.perf_counter() - began
+            yield frame
+
+    engine.frames = timed
+    return engine
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -109,7 +126,8 @@ def run(options: argparse.Namespace) -> int:
     """Run the command; 1 if the session reported an error."""
     tasks, task = chosen_task(options)
     out = ready_to_write(options.out, ".json")
-    scenario, shown, engine = _scenario(task, options), Recorder(), new_engine(tasks)
+    scenario, shown = _scenario(task, options), Recorder()
+    engine = _timed(new_engine(tasks), shown)
     engine.nominal(scenario)  # learned before
     session = Session(engine, lambda _: scenario, task.name, shown)
     positions = moving_through(task)
