@@ -195,18 +195,19 @@ class WholeArm:
         flows would hold each other up, and motions turn back between them.
         """
         q, parts, margin = lifted.tracked.q[lifted.shaping], avoidance.avoided.parts, avoidance.margin
+        beside = max(BESIDE, margin)
         tangents = np.gradient(self.robot.end_effector(q), axis=1).reshape(-1, 3)
         tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
         q = q.reshape(-1, NUM_JOINTS)
         near: Mask = np.array([self.clearance(q, part, margin, margin - ROUNDING) < margin for part in parts])
         near = near.reshape(len(parts), len(q))
-        clearance = np.array([self.body.outermost.clearance(self.robot, q, part, BESIDE) for part in parts])  # about
+        clearance = np.array([self.body.outermost.clearance(self.robot, q, part, beside) for part in parts])  # about
         clearance = clearance.reshape(len(parts), len(q))
 
         def escapes(which: Indices) -> list[Array]:
             """Directions that leave all of these obstacles."""
             collides = np.flatnonzero(near[which].any(axis=0))
-            bent = np.flatnonzero((clearance[which] < BESIDE).any(axis=0))
+            bent = np.flatnonzero((clearance[which] < beside).any(axis=0))
             compared = q[collides[:: max(1, len(collides) // NUM_COMPARED)]]
             return escape_directions(
                 self.body.of_chain(self.robot.chain(compared.T)),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +17,7 @@ from dt_viz.avoidance.arm_field import (
     WholeArmField,
 )
 from dt_viz.avoidance.avoidance import ArmAvoidance
-from dt_viz.avoidance.clearing import clearing_duration
+from dt_viz.avoidance.clearing import Lack, clearing_duration
 from dt_viz.avoidance.detour import Detour
 from dt_viz.avoidance.lift import Lift
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Diffeomorphism, Flow, Identity
@@ -140,7 +140,7 @@ class Solver:
         elif duration is None:
             shaping = self._lifted.tracked.q[self._lifted.shaping]
             q = self._limits.inside(shaping[:, ::STRIDE].reshape(-1, NUM_JOINTS))
-            duration = self._clearing_duration(q[self._lack(q) > 0])
+            duration = self._clearing_duration(q)
         return self._with_duration(float(np.clip(duration, *self._between)))
 
     def _with_duration(self, duration: float) -> ArmSolution:
@@ -219,19 +219,20 @@ class Solver:
 
         return refined(bundle, integrated, max(self._spacing, COARSE_SPACING) if self._coarse else self._spacing)
 
-    def _lack(self, p: Array) -> Array:
-        """(N,) metres by which the arm at configurations (N, 6) misses the clearance that is asked for."""
-        asked, kept = self._clearances(p)
+    def _lack(self, p: Array, most: float) -> Array:
+        """Metres (N,), up to `most`, by which the arm at configurations (N, 6) misses the clearance asked for."""
+        asked, kept = self._clearances(p, most)
         return asked - kept
 
-    def _clearances(self, p: Array) -> tuple[Array, Array]:
+    def _clearances(self, p: Array, most: float = np.inf) -> tuple[Array, Array]:
         """Clearances (N,), metres, that are asked for at configurations (N, 6), and that are kept.
 
         Asked for is the margin, or what the starts and goal beside a configuration have. What is kept is cut off where
-        it is more by what a contact moves between two checks.
+        it is more by what a contact moves between two checks, or less by `most`.
         """
         asked = room_asked(np.array(p, order="C"), self._lifted.pins, self._room, LEVERS, SLOPE, self._margin)
-        return asked, self._body.clearance(self._robot, p, self._avoidance.avoided, asked + SPEED * SNAPSHOT)
+        highest = asked + SPEED * SNAPSHOT
+        return asked, self._body.clearance(self._robot, p, self._avoidance.avoided, highest, asked - most)
 
     def _clearing_duration(self, p: Array) -> float:
         """The shortest duration after which the flow has carried configurations (N, 6) clear, or the longest."""
@@ -239,18 +240,16 @@ class Solver:
         return clearing(self._generator, self._limits, p, self._lack, SNAPSHOT, self._between[1])
 
 
-def clearing(
-    field: VectorField, limits: JointLimits, p: Array, lack: Callable[[Array], Array], step: float, longest: float
-) -> float:
+def clearing(field: VectorField, limits: JointLimits, p: Array, lack: Lack, step: float, longest: float) -> float:
     """The shortest time after which the reverse flow of a field has carried postures clear, or the longest.
 
     Args:
         field: generator of the flow, in the coordinates of the limits.
         limits: of the joints.
         p: (N, 6) rad.
-        lack: distances (N,), metres, by which postures (N, 6) miss the clearance that is asked for.
+        lack: metres by which postures miss the clearance that is asked for.
         step: flow time between two checks of the clearance.
         longest: flow time.
     """
-    duration = clearing_duration(field, limits.forward(p), lambda state: lack(limits.inverse(state)), step, longest)
+    duration = clearing_duration(field, limits.forward(p), lambda z, most: lack(limits.inverse(z), most), step, longest)
     return longest if duration is None else duration

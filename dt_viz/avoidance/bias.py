@@ -131,7 +131,7 @@ class BiasPoint(Anchored):
             more = clearing_duration(
                 waist,
                 passing,
-                lambda s: np.log(np.maximum(np.linalg.norm(point.offsets(s), axis=1), 1e-300) / AIM),
+                lambda s, _: np.log(np.maximum(np.linalg.norm(point.offsets(s), axis=1), 1e-300) / AIM),
                 SNAPSHOT,
                 gathering - least,
             )

@@ -15,9 +15,11 @@ MAX_STEPS, SHORTEST = 100, 1e-4
 """Largest number of steps along a line, and the smallest one, metres: bounds the overshoot beyond the surface."""
 
 
-def clearing_duration(
-    field: VectorField, points: Array, lack: Callable[[Array], Array], step: float, longest: float
-) -> float | None:
+Lack = Callable[[Array, float], Array]
+"""What points (N, d) lack to be clear, (N,), at most 0 where they are; beyond the given lack, only that."""
+
+
+def clearing_duration(field: VectorField, points: Array, lack: Lack, step: float, longest: float) -> float | None:
     """Find the shortest duration after which the reverse flow has carried all points clear.
 
     γ is a one-parameter group, so one integration with snapshots passes every duration on its way; points that are
@@ -26,23 +28,24 @@ def clearing_duration(
     Args:
         field: generator of the flow.
         points: (N, d) before the flow.
-        lack: what points (N, d) lack to be clear, (N,); at most 0 where they are.
+        lack: what points lack to be clear.
         step: flow time between two snapshots, one step of RK4.
         longest: flow time.
 
     Returns:
         The duration, or None where some point is not clear after the longest.
     """
-    duration, lacking = 0.0, lack(points)
-    while (left := lacking > 0).any():
+    duration, before = 0.0, points
+    while (lacking := lack(points, SHORTEST) > 0).any():
         if duration >= longest:
             return None
-        before = lacking[left]
-        points = Flow(field, step, 1).inverse(points[left])
-        lacking = lack(points)
-        part = 1.0 if (lacking > 0).any() else float((before / np.maximum(before - lacking, 1e-12)).clip(0, 1).max())
-        duration += part * step
-    return duration
+        before = points[lacking]
+        points = Flow(field, step, 1).inverse(before)
+        duration += step
+    if not duration:
+        return 0.0
+    lacked, left = lack(before, np.inf), lack(points, np.inf)
+    return duration - step + step * float((lacked / np.maximum(lacked - left, 1e-12)).clip(0, 1).max())
 
 
 def escape_lengths(obstacle: Obstacle | Union, points: Array, directions: Array, margin: float = 0.0) -> Array:

@@ -105,7 +105,7 @@ class HandAvoidance(Avoidance, Planar, space="task"):
             if at_least > 0:
                 points = AdaptiveFlow(field, at_least, TOLERANCE).inverse(points)
             more = clearing_duration(
-                field, points, lambda s: margin - obstacle.signed_distance(s), SNAPSHOT, MAX_DURATION - at_least
+                field, points, lambda s, _: margin - obstacle.signed_distance(s), SNAPSHOT, MAX_DURATION - at_least
             )
             duration = None if more is None else at_least + more
             # a coarse flow that is not clear after the time of the exact one needs more steps, not more time

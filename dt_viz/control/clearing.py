@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
@@ -86,8 +85,9 @@ def clearing(
     chain = arm.robot.chain(q.T)
     points, tangents = arm.body.of_chain(chain), np.gradient(chain.position.T, axis=0) if len(q) > 1 else 0 * q[:, :3]
     tangents = tangents / np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
+    beside = max(BESIDE, avoidance.margin)  # that of what is fast may be wider
     directions = tuple(
-        _direction(arm, points, arm.clearance(q, part, BESIDE), tangents, part, velocity, avoidance, way, turn)
+        _direction(arm, points, arm.clearance(q, part, beside), tangents, part, velocity, avoidance, way, turn)
         for part, velocity, way in zip(parts, velocities, known, strict=True)
     )
     met = [(part, way) for part, way in zip(parts, directions, strict=True) if way is not None]
@@ -96,7 +96,10 @@ def clearing(
     obstacles, ways = zip(*met, strict=True)
     reach = max(REACH_PER_TEMPERATURE * avoidance.temperature, avoidance.margin + BEYOND)
     field = WholeArmField(arm.robot, arm.body, obstacles, np.stack(ways), NO_PINS, reach)
-    lacking = partial(lack, arm, avoidance=avoidance, end=end)
+
+    def lacking(p: Array, most: float) -> Array:
+        return lack(arm, p, avoidance, end, most)
+
     return Clearing(field, directions, clearing_time(field, arm.limits, q, lacking, STEP, MAX_DURATION))
 
 
@@ -113,12 +116,12 @@ def _direction(
 ) -> Array | None:
     """Choose the escape direction (3,) from one obstacle; that before where no posture comes too near it.
 
-    Points (P, 3, N) and clearance (N,) are those of the same postures.
+    Points (P, 3, N) and clearance (N,), up to what is beside the obstacle, are those of the same postures.
     """
     near = np.flatnonzero(clearance < avoidance.margin)
     if not len(near):
         return before
-    bent = np.flatnonzero(clearance < BESIDE)
+    bent = np.flatnonzero(clearance < max(BESIDE, avoidance.margin))
     num = NUM_COMPARED // 2 if velocity.any() else NUM_COMPARED
     compared = points[:, :, near[:: max(1, len(near) // num)]]
     escapes = escape_directions(
@@ -135,8 +138,8 @@ def _direction(
     return escapes[0] if before is None else turned(before, escapes[0], turn, escapes)
 
 
-def lack(arm: WholeArm, p: Array, avoidance: ArmAvoidance, end: Array | None) -> Array:
-    """Distances (N,), metres, by which postures p (N, 6) miss the clearance that is asked for.
+def lack(arm: WholeArm, p: Array, avoidance: ArmAvoidance, end: Array | None, most: float) -> Array:
+    """Distances (N,), metres, by which postures p (N, 6) miss the clearance that is asked for, up to `most`.
 
     That is the margin, or beside a free posture `end` (6,) that has less itself, what it has.
     """
@@ -144,4 +147,4 @@ def lack(arm: WholeArm, p: Array, avoidance: ArmAvoidance, end: Array | None) ->
     room = arm.clearance(pins, avoidance.avoided) - ROUNDING
     pins, room = pins[room > 0], room[room > 0]
     asked = room_asked(np.array(p, order="C"), pins, room, LEVERS, SLOPE, float(avoidance.margin))
-    return asked - arm.clearance(p, avoidance.avoided, asked + SPEED * STEP)
+    return asked - arm.clearance(p, avoidance.avoided, asked + SPEED * STEP, asked - most)

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from itertools import count
 from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
@@ -258,9 +259,11 @@ def _fit_trajectories(motions: Motions, settings: ImitationSettings, progress: P
     progress(0.05, "unbending the mean demonstration")
     chain, thetas, ends, regularisation = _initial_guess(normalised, _width(motions, settings), settings)
 
-    def report(iteration: int, rms: float) -> None:
-        done = 0.1 + 0.8 * iteration / settings.max_iterations
-        progress(done, f"fitting, {100 * rms:.1f} % of the spread off")
+    iterations = count(1)
+
+    def report(_: int, rms: float) -> None:
+        num = next(iterations)  # of all solutions: how many there will be is not known
+        progress(0.1 + 0.8 * num / (num + settings.max_iterations), f"fitting, {100 * rms:.1f} % of the spread off")
 
     for weight in dict.fromkeys((regularisation, settings.regularisation)):  # from as smooth a fit as the guess
         problem = TrajectoryFit(chain, normalised, importance, weight, settings.min_determinant)

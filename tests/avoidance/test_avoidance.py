@@ -30,11 +30,24 @@ def passing_points(seed, num=40, sphere=SPHERE):
 
 def clearing(field, sphere, points, margin=MARGIN):
     """The shortest duration that clears points of a sphere."""
-    return clearing_duration(field, points, lambda s: margin - sphere.signed_distance(s), SNAPSHOT, MAX_DURATION)
+    return clearing_duration(field, points, lambda s, _: margin - sphere.signed_distance(s), SNAPSHOT, MAX_DURATION)
 
 
 def carried(field, points, duration):
     return AdaptiveFlow(field, duration, 1e-9).inverse(points)
+
+
+def test_the_clearing_duration_needs_no_size_of_what_is_far_from_clear():
+    asked, field = [], SPHERE.field("free-space", 6.0)
+    points = np.array(SPHERE.position) + np.random.default_rng(0).uniform(-0.05, 0.05, (40, 3))
+
+    def cut_off(s, most):
+        asked.append(most)
+        return np.minimum(MARGIN - SPHERE.signed_distance(s), most)
+
+    duration = clearing_duration(field, points, cut_off, SNAPSHOT, MAX_DURATION)
+    assert 0 < duration == clearing(field, SPHERE, points)
+    assert len(asked) > 4 and np.isinf(asked[-2:]).all() and max(asked[:-2]) < 1e-3  # only the last ones are measured
 
 
 @given(seeds, st.sampled_from([1.0, 6.0, 20.0]))

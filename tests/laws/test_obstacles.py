@@ -160,7 +160,7 @@ def test_a_motion_through_it_is_cleared(obstacle):
     along = np.array([0.6, 0.64, 0.48])
     path = np.asarray(obstacle.position) + np.array([1e-3, 2e-3, 1e-3]) + np.linspace(-0.4, 0.4, 401)[:, None] * along
     field = obstacle.field("free-space", 3.0)
-    duration = clearing_duration(field, path, lambda s: 0.01 - obstacle.signed_distance(s), 0.05, 2.5)
+    duration = clearing_duration(field, path, lambda s, _: 0.01 - obstacle.signed_distance(s), 0.05, 2.5)
     assert duration is not None and 0 < duration < 2.5
 
 

@@ -11,12 +11,13 @@ from dt_viz.errors import FormatError
 from dt_viz.flows.diffeomorphisms import Flow, min_det_jacobian
 from dt_viz.flows.fields import GaussianGrid, GridRBF
 from dt_viz.flows.integrators import EULER, IMPLICIT_EULER, carried
-from dt_viz.learning.demonstrations import Demonstration
+from dt_viz.learning.demonstrations import Demonstration, load_demonstrations
 from dt_viz.learning.flow_chain import FlowChain, FlowLayer, equally_spaced_grid, min_step_determinant
 from dt_viz.learning.imitation import Imitation, ImitationSettings, fit
 from dt_viz.learning.initial_guess import unbending
 from dt_viz.learning.preparation import ImitationError
 from dt_viz.learning.velocity import VelocityFit
+from dt_viz.shipped import ASSETS
 
 
 def hooks(dim, num=4, seed=0, scale=1.0):
@@ -64,6 +65,18 @@ def test_its_clock_is_known_three_knots_beyond_the_farthest_start(learned):
     radii = np.linalg.norm(imitation.system.transform.forward(imitation.starts) - base.goal, axis=1)
     clock = base.smoothing / base.speed * np.log(np.sinh(radii.max() / base.smoothing))
     np.testing.assert_allclose(base.knots[-4], clock, atol=1e-9)
+
+
+def test_progress_never_goes_back():
+    done, fitting = [], []
+
+    def note(part, text):
+        done.append(part)
+        fitting.append(text.startswith("fitting"))
+
+    fit(load_demonstrations(ASSETS / "draw_s.npz"), progress=note)
+    assert sum(fitting) > ImitationSettings().max_iterations  # it begins anew, as it would fold
+    assert done == sorted(done) and done[-1] == 1.0
 
 
 def test_progress_can_cancel():
