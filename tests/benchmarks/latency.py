@@ -100,9 +100,14 @@ def _timed(engine: Engine, shown: Recorder) -> Engine:
     frames = engine.frames
 
     def timed(*scenario: Any, **others: Any) -> Iterator[Frame]:
-        began = time.perf_counter()
-        for frame in frames(*scenario, **others):
-            shown.seconds = time.perf_counter() - began
+        computing, spent = frames(*scenario, **others), 0.0
+        while True:
+            began = time.perf_counter()
+            frame = next(computing, None)
+            spent += time.perf_counter() - began
+            if frame is None:
+                return
+            shown.seconds = spent  # without what is done with the frames
             yield frame
 
     engine.frames = timed
