@@ -25,8 +25,7 @@ from dt_viz.kernels.blocks import room_asked
 from dt_viz.kernels.dodging import Forecast, LimitedArm, dodge
 from dt_viz.kernels.proximity import contacts, least_contacts, proximity
 from dt_viz.kernels.splines import cubics
-from dt_viz.obstacles.arrays import records
-from dt_viz.obstacles.shapes import Obstacle, Sphere
+from dt_viz.obstacles.shapes import Obstacle, Sphere, records
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.body_points import BodyPoints
 from dt_viz.robot.inverse_kinematics import track

@@ -18,8 +18,7 @@ from dt_viz.flows.fields import Array, CompiledField
 from dt_viz.kernels import escape
 from dt_viz.kernels.dormand_prince import RATE
 from dt_viz.kernels.joint_limits import stretched
-from dt_viz.obstacles.arrays import records
-from dt_viz.obstacles.shapes import Obstacle
+from dt_viz.obstacles.shapes import Obstacle, records
 from dt_viz.robot.body_points import BodyPoints
 from dt_viz.robot.robot import NUM_JOINTS, Robot, cross
 

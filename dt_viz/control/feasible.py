@@ -14,7 +14,7 @@ from dt_viz.control.obstacle_motion import Sighting
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.flows.fields import Array
 from dt_viz.kernels.dodging import Forecast, LimitedArm, dodge
-from dt_viz.obstacles.arrays import records
+from dt_viz.obstacles.shapes import records
 from dt_viz.robot.body_points import BodyPoints
 from dt_viz.robot.robot import NUM_JOINTS
 

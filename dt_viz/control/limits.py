@@ -10,7 +10,7 @@ from dt_viz.avoidance.arm import WholeArm
 from dt_viz.control.obstacle_motion import Sighting
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.kernels.proximity import contacts, least_contacts, proximity
-from dt_viz.obstacles.arrays import records
+from dt_viz.obstacles.shapes import records
 from dt_viz.robot.body_points import BodyPoints
 from dt_viz.robot.robot import Robot
 

@@ -1,4 +1,4 @@
-"""Signed distance of a point from obstacles: the formulas of `dt_viz.obstacles`, point by point.
+"""Signed distance of a point from obstacles.
 
 All functions are analytic: points may be a tiny complex step away from real ones, and the imaginary part of the result
 is then the derivative in that direction.
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dt_viz.kernels.compiled import compiled
+from dt_viz.kernels.compiled import compiled, kernel
 
 SPHERE, BOX, CYLINDER, GRID = 0, 1, 2, 3
 """Kinds of shapes."""
@@ -43,6 +43,24 @@ Shapes = NDArray[Any]
 """(K,) obstacles of dtype `SHAPE`."""
 Values = NDArray[np.float32]
 """(V,) signed distances of the nodes of all grids, last axis fastest."""
+
+
+@kernel
+def distances(shapes: Shapes, values: Values, points: NDArray[Any]) -> NDArray[Any]:
+    """Distances (N,) of points (N, 3) from the nearest surface, metres, negative inside; infinite without obstacles."""
+    found = np.empty(len(points), points.dtype)
+    found[:] = np.inf
+    for i in range(len(points)):
+        for k in range(len(shapes)):
+            away = distance(shapes[k], values, points[i, 0], points[i, 1], points[i, 2])
+            if away.real < found[i].real:
+                found[i] = away
+    return found
+
+
+def batch(s: NDArray[Any]) -> NDArray[Any]:
+    """Return points (*B, 3) as an array (N, 3) for which `distances` is compiled."""
+    return np.ascontiguousarray(s.reshape(-1, 3), complex if np.iscomplexobj(s) else float)
 
 
 @compiled
@@ -84,7 +102,7 @@ def beyond_edge(across: Number, along: Number) -> Number:
 
 @compiled
 def _on_grid(shape: Record, values: Values, u: Number, v: Number, w: Number) -> Number:
-    """Interpolate a distance grid by quadratic splines; beyond it as `dt_viz.obstacles.solids.DistanceGrid`."""
+    """Interpolate a distance grid by quadratic splines; see `dt_viz.obstacles.solids.DistanceGrid`."""
     first, counts, cell = shape.first, shape.counts, shape.cell
     a, i, beyond_x = _within((u - first[0]) / cell, counts[0])
     b, j, beyond_y = _within((v - first[1]) / cell, counts[1])

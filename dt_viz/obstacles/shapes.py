@@ -11,11 +11,12 @@ import numpy as np
 
 from dt_viz.errors import check_between
 from dt_viz.flows.fields import Array, Indices, Mask, PlacedField
+from dt_viz.kernels.distances import BOX, CYLINDER, SHAPE, SPHERE, Shapes, Values, batch, distances
 from dt_viz.obstacles.clouds import Cloud
 from dt_viz.obstacles.covers import box_cover, cylinder_cover
 from dt_viz.obstacles.learned_maps import solid_map, unit_map, unit_sizes
 from dt_viz.obstacles.occupancy import AvoidanceField, Generator, OccupancyMap
-from dt_viz.obstacles.solids import Solid
+from dt_viz.obstacles.solids import DistanceGrid, Solid
 from dt_viz.obstacles.surfaces import box_surface, lathe
 
 Point = tuple[float, float, float]
@@ -44,7 +45,7 @@ def as_quaternion(v: Array) -> Quaternion:
 class Obstacle(ABC):
     """A solid somewhere in the world: an immutable value, cheap to move.
 
-    A shape gives its distance, map and cover in a frame of its own.
+    A shape gives its record for compiled loops, map and cover in a frame of its own.
     """
 
     position: Point
@@ -68,9 +69,15 @@ class Obstacle(ABC):
     def surface(self) -> tuple[Array, Indices]:
         """Return the drawn mesh: vertices (V, 3), metres, in its own frame, and faces (F, 3), outward."""
 
+    @property
     @abstractmethod
-    def _distance(self, own: Array) -> Array:
-        """Compute signed distances (*B,) of points (*B, 3), both in its own frame."""
+    def record(self) -> dict[str, Any]:
+        """Fields of its `dt_viz.kernels.distances.SHAPE`, but its place; its kind decides its distance."""
+
+    @property
+    def grid(self) -> DistanceGrid | None:
+        """Grid on which its signed distance is sampled, in its own frame; None where a formula gives it."""
+        return None
 
     @abstractmethod
     def _map(self) -> tuple[OccupancyMap, Array, Array]:
@@ -91,7 +98,7 @@ class Obstacle(ABC):
         Its slope is nowhere above 1 (of triangles, by two percent in places). Analytic in `s`: derivatives by complex
         steps are exact.
         """
-        return self.scale * self._distance((s - np.asarray(self.position)) @ rotation(self.wxyz) / self.scale)
+        return nearest((self,), s)
 
     def field(self, generator: Generator, temperature: float) -> PlacedField:
         """Return the generator whose reverse flow leaves the shape, learned once for all its places."""
@@ -137,8 +144,9 @@ class Sphere(Obstacle):
         vertices, faces = lathe(list(zip(np.sin(turn), -np.cos(turn), strict=True)))
         return self.radius * vertices, faces
 
-    def _distance(self, own: Array) -> Array:
-        return np.sqrt((own * own).sum(axis=-1)) - self.radius
+    @property
+    def record(self) -> dict[str, Any]:
+        return {"kind": SPHERE, "half": self.radius}
 
     def _map(self) -> tuple[OccupancyMap, Array, Array]:
         return unit_map(Sphere(ORIGIN, 2.0)), self.radius * np.eye(3), np.zeros(3)
@@ -176,9 +184,9 @@ class Box(Obstacle):
     def surface(self) -> tuple[Array, Indices]:
         return box_surface(self._half)
 
-    def _distance(self, own: Array) -> Array:
-        x, y, z = (_magnitude(own[..., i]) - self._half[i] for i in range(3))
-        return _beyond_faces(x, y, z)
+    @property
+    def record(self) -> dict[str, Any]:
+        return {"kind": BOX, "half": self._half}
 
     def _map(self) -> tuple[OccupancyMap, Array, Array]:
         x, y, z = unit = unit_sizes(self._half)
@@ -220,9 +228,9 @@ class Cylinder(Obstacle):
         radius, _, half = self._half
         return lathe([(0, -half), (radius, -half), (radius, half), (0, half)])
 
-    def _distance(self, own: Array) -> Array:
-        x, y, z = (own[..., i] for i in range(3))
-        return _beyond_faces(np.sqrt(x * x + y * y) - self._half[0], _magnitude(z) - self._half[2])
+    @property
+    def record(self) -> dict[str, Any]:
+        return {"kind": CYLINDER, "half": self._half}
 
     def _map(self) -> tuple[OccupancyMap, Array, Array]:
         radius, _, half = unit = unit_sizes(self._half)
@@ -267,8 +275,13 @@ class TriangleObstacle(Obstacle):
     def surface(self) -> tuple[Array, Indices]:
         return self.scale * self.solid.vertices, self.solid.faces
 
-    def _distance(self, own: Array) -> Array:
-        return self.solid.distances(own)
+    @property
+    def grid(self) -> DistanceGrid:
+        return self.solid.distances
+
+    @property
+    def record(self) -> dict[str, Any]:
+        return {**self.grid.record, "scale": self.scale}
 
     def _map(self) -> tuple[OccupancyMap, Array, Array]:
         return solid_map(self.solid)
@@ -333,16 +346,24 @@ def rotation(wxyz: Quaternion) -> Array:
     return matrix
 
 
-def _magnitude(x: Array) -> Array:
-    return np.where(x.real < 0, -x, x)
+@lru_cache(maxsize=64)
+def records(parts: tuple[Obstacle, ...]) -> tuple[Shapes, Values]:
+    """Convert obstacles to the records that compiled loops take, and the values of their grids."""
+    shapes = np.zeros(len(parts), SHAPE)
+    grids = tuple(dict.fromkeys(part.grid for part in parts if part.grid is not None))
+    begins = dict(zip(grids, np.cumsum([0, *(grid.values.size for grid in grids)]).tolist(), strict=False))
+    for shape, part in zip(shapes, parts, strict=True):
+        fields = {"position": part.position, "axes": rotation(part.wxyz), "begin": begins.get(part.grid, 0)}
+        for name, value in {**part.record, **fields}.items():
+            shape[name] = value
+    return shapes, _joined(grids)
 
 
-def _beyond_faces(*excess: Array) -> Array:
-    """Return the signed distance from a box, given the excesses of coordinates over its half sizes."""
-    inside, squared = excess[0], np.zeros(())
-    for x in excess[1:]:
-        inside: Array = np.where(x.real > inside.real, x, inside)
-    for x in excess:
-        beyond: Array = np.where(x.real > 0, x, 0.0)
-        squared = squared + beyond * beyond
-    return np.where(inside.real > 0, np.sqrt(squared), inside)
+@lru_cache(maxsize=8)
+def _joined(grids: tuple[DistanceGrid, ...]) -> Values:
+    return np.concatenate([np.empty(0, np.float32), *(grid.coefficients for grid in grids)])
+
+
+def nearest(parts: tuple[Obstacle, ...], s: Array) -> Array:
+    """Compute the distances (*B,), metres, of points `s` (*B, 3) from the nearest obstacle; see `signed_distance`."""
+    return distances(*records(parts), batch(s)).reshape(s.shape[:-1])

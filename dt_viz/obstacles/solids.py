@@ -12,6 +12,7 @@ import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
@@ -21,6 +22,7 @@ from trimesh.triangles import closest_point
 from dt_viz.errors import check_between
 from dt_viz.files.checks import check_triangles
 from dt_viz.flows.fields import Array, Indices
+from dt_viz.kernels.distances import GRID, SHAPE, Values, batch, distances
 from dt_viz.numerics import divisor, unit
 from dt_viz.obstacles.covers import cells_cover
 from dt_viz.obstacles.triangles import grid_nodes, inside_of_grid, surface_samples
@@ -153,37 +155,22 @@ class DistanceGrid:
         point of the border, o = s − c and m the margin, d² = d(c)² + |o|² + 2m·Σ|o_i|; or the distance from the ball
         that holds the shape, whatever is larger.
         """
-        points, num = s.reshape(-1, 3), 2048  # points whose intermediate results stay in the cache
-        blocks = [self._evaluate(points[i : i + num]) for i in range(0, len(points), num)]
-        return np.concatenate([np.empty(0), *blocks]).reshape(s.shape[:-1])
+        shape = np.zeros(1, SHAPE)
+        shape["axes"], shape["scale"] = np.eye(3), 1.0
+        for name, value in self.record.items():
+            shape[name] = value
+        return distances(shape, self.coefficients, batch(s)).reshape(s.shape[:-1])
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """Fields of its `dt_viz.kernels.distances.SHAPE`."""
+        grid = {"first": self.origin, "cell": self.cell, "counts": self.values.shape, "margin": self.margin}
+        return {"kind": GRID, **grid, "centre": self.centre, "radius": self.radius}
 
     @cached_property
-    def _coefficients(self) -> tuple[Array, Indices]:
-        """The values, flat and in single precision, which fits the cache; offsets of a node's neighbours."""
-        strides = np.array([self.values.shape[1] * self.values.shape[2], self.values.shape[2], 1])
-        around = (np.stack(np.meshgrid(*3 * [[-1, 0, 1]], indexing="ij"), axis=-1) @ strides).ravel()
-        return self.values.astype(np.float32).ravel(), around
-
-    def _evaluate(self, s: Array) -> Array:
-        """Values (N,) at points `s` (N, 3); complex numbers are ordered by their real parts."""
-        shape = np.array(self.values.shape)[:, None]
-        t = (s.T - self.origin[:, None]) / self.cell  # the batch last, for long inner loops
-        clipped: Array = np.minimum(np.maximum(t, 0.5), shape - 1.5)
-        node = np.minimum((clipped.real + 0.5).astype(np.intp), shape - 2)
-        f = clipped - node  # from −1/2 to 1/2
-        flat, around = self._coefficients
-        first = (node[0] * shape[1] + node[1]) * shape[2] + node[2]
-        block = flat.take(first + around[:, None]).astype(float).reshape(3, 3, 3, -1)  # (x, y, z, N)
-        weights = np.stack([0.5 * (0.5 - f) ** 2, 0.75 - f * f, 0.5 * (0.5 + f) ** 2])  # (3, 3 axes, N)
-        along_yz = np.einsum("xyn,yn->xn", np.einsum("xyzn,zn->xyn", block, weights[:, 2]), weights[:, 1])
-        value = np.einsum("xn,xn->n", along_yz, weights[:, 0])
-        outside = np.flatnonzero((t != clipped).any(axis=0))
-        if len(outside):
-            o, inner = self.cell * (t - clipped)[:, outside], np.maximum(value[outside], self.margin)
-            sides = np.maximum(o, -o).sum(axis=0)
-            value[outside] = np.sqrt(inner * inner + (o * o).sum(axis=0) + 2 * self.margin * sides)
-        offset = s - self.centre
-        return np.maximum(value, np.sqrt((offset * offset).sum(axis=1)) - self.radius)
+    def coefficients(self) -> Values:
+        """Values, flat and in single precision, which fits the processor's cache."""
+        return self.values.astype(np.float32).ravel()
 
 
 def with_slopes(distance: Callable[[Array], Array], s: Array) -> tuple[Array, Array]:

@@ -9,7 +9,7 @@ import numpy as np
 from dt_viz.flows.fields import Array, Sum
 from dt_viz.numerics import unit
 from dt_viz.obstacles.occupancy import Generator
-from dt_viz.obstacles.shapes import Obstacle
+from dt_viz.obstacles.shapes import Obstacle, nearest
 from dt_viz.obstacles.solids import with_slopes
 from dt_viz.obstacles.surfaces import golden_spiral
 
@@ -25,11 +25,7 @@ class Union:
 
         Inside more than one it may be smaller than the depth of the union. Infinite where there is no obstacle.
         """
-        nearest: Array = np.full(s.shape[:-1], np.inf, dtype=s.dtype)
-        for part in self.parts:
-            distance = part.signed_distance(s)
-            nearest = np.where(distance.real < nearest.real, distance, nearest)
-        return nearest
+        return nearest(self.parts, s)
 
     def distance_and_normal(self, s: Array) -> tuple[Array, Array]:
         """Signed distance (N,), metres, of points `s` (N, 3), and unit vectors (N, 3) away from the nearest surface.

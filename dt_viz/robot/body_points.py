@@ -13,8 +13,7 @@ from dt_viz.flows.fields import Array, Indices
 from dt_viz.kernels.arm import BODY_POINT
 from dt_viz.kernels.blocks import clearance
 from dt_viz.kernels.proximity import least_contacts
-from dt_viz.obstacles.arrays import records
-from dt_viz.obstacles.shapes import Obstacle
+from dt_viz.obstacles.shapes import Obstacle, records
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.robot import NUM_JOINTS, KinematicChain, Robot
 from dt_viz.shipped import ASSETS

@@ -7,8 +7,7 @@ import pytest
 from body_spheres import cover
 
 from dt_viz.kernels.dodging import ENOUGH, Forecast, LimitedArm, dodge
-from dt_viz.obstacles.arrays import records
-from dt_viz.obstacles.shapes import Box, Sphere, as_point
+from dt_viz.obstacles.shapes import Box, Sphere, as_point, records
 from dt_viz.robot.body_points import load_body_points
 from dt_viz.robot.robot import load_jaco
 
