@@ -2,7 +2,7 @@
 
 The joints follow the end effector by the pseudo-inverse: q(t) = Q(x(t)) with one section Q for all rollouts of a task
 (`robot.inverse_kinematics.track` with a shared reference). It does not depend on the obstacle, so it is computed once;
-a drag costs p(t) = ψ_q⁻¹(q(t)) only, one batched flow in R⁶.
+a drag costs p(t) = ψ_q⁻¹(q(t)) only, one batched flow in Rⁿ.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from dt_viz.avoidance.arm_field import LEVERS, JointLimits, WholeArmField
+from dt_viz.avoidance.arm_field import JointLimits, WholeArmField
 from dt_viz.avoidance.arm_solver import MAX_DURATION, ROUNDING, SLOPE, ArmSolution, Solver
 from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.avoidance.detour import Detour, carried_over, escape_directions
@@ -28,9 +28,8 @@ from dt_viz.kernels.splines import cubics
 from dt_viz.obstacles.arrays import records
 from dt_viz.obstacles.shapes import Obstacle, Sphere
 from dt_viz.obstacles.union import Union
-from dt_viz.robot.body_points import BodyPoints
 from dt_viz.robot.inverse_kinematics import track
-from dt_viz.robot.robot import NUM_JOINTS, Robot
+from dt_viz.robot.robot import Robot
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -51,30 +50,28 @@ BESIDE = 0.20
 class WholeArm:
     """Makes the arm's motions clear an obstacle, by a diffeomorphism of configuration space."""
 
-    def __init__(self, robot: Robot, body: BodyPoints) -> None:
+    def __init__(self, robot: Robot) -> None:
         self.robot = robot
-        self.links = body.on_moving_links
-        """Points of the links."""
-        self.body = self.links.with_end_effector(robot)
-        """The same, and what the hand holds."""
+        self.body = robot.links.with_end_effector(robot)
+        """Body points of the links, and what the hand holds."""
         self.limits = JointLimits(robot.lower, robot.upper)
         self._solver = partial(Solver, robot, self.body, self.limits)
 
     def compiled(self) -> Iterator[float]:
         """Compile what a drag repeats for this processor, or load what was compiled before; yields the part done."""
-        q, obstacle = self.robot.home[None], Sphere((0.0, 0.0, 0.0))
-        field = WholeArmField(self.robot, self.body, (obstacle,), np.eye(3)[:1], np.empty((0, NUM_JOINTS)))
-        points = self.body.of_chain(self.robot.chain(q.T))
+        robot, q, obstacle = self.robot, self.robot.home[None], Sphere((0.0, 0.0, 0.0))
+        field = WholeArmField(robot, self.body, (obstacle,), np.eye(3)[:1], q[:0])
+        points = self.body.of_chain(robot.chain(q.T))
         shapes, values = records((obstacle,))
-        joints, links, still = self.robot.records, self.links.spheres, np.zeros(NUM_JOINTS)
+        joints, links, still = robot.records, robot.links.spheres, np.zeros(robot.num_joints)
         dodging, ones = LimitedArm(joints, links, still, still, still, 1.0), np.ones((1, 1))
         forecast = Forecast(shapes, values, np.ones(1), np.ones((1, 1, 3)), ones, 0.0, 0.0, 1.0)
         calls: tuple[Callable[[], object], ...] = (
-            lambda: self.robot.end_effector(q),
+            lambda: robot.end_effector(q),
             lambda: self.clearance(q, obstacle),
-            lambda: track(self.robot, self.robot.end_effector(q)[:, None], q, reference=q),
-            lambda: cubics(np.arange(4.0)[None], np.zeros((1, 4, NUM_JOINTS))),
-            lambda: room_asked(q, q, np.zeros(1), LEVERS, SLOPE, 0.0),
+            lambda: track(robot, robot.end_effector(q)[:, None], q, reference=q),
+            lambda: cubics(np.arange(4.0)[None], np.zeros((1, 4, robot.num_joints))),
+            lambda: room_asked(q, q, np.zeros(1), np.array(robot.levers), SLOPE, 0.0),
             lambda: proximity(joints, links, shapes, values, q[0].copy(), 1.0),
             lambda: contacts(joints, links, np.array([[-1, 0]]), q[0].copy(), 1.0),
             lambda: least_contacts(joints, links, np.array([[-1, 0]]), q.copy(), 1.0),
@@ -198,7 +195,7 @@ class WholeArm:
         beside = max(BESIDE, margin)
         tangents = np.gradient(self.robot.end_effector(q), axis=1).reshape(-1, 3)
         tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
-        q = q.reshape(-1, NUM_JOINTS)
+        q = q.reshape(-1, q.shape[-1])
         near: Mask = np.array([self.clearance(q, part, margin, margin - ROUNDING) < margin for part in parts])
         near = near.reshape(len(parts), len(q))
         clearance = np.array([self.body.outermost.clearance(self.robot, q, part, beside) for part in parts])  # about

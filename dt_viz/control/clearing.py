@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dt_viz.avoidance.arm import BESIDE, WholeArm
-from dt_viz.avoidance.arm_field import LEVERS, REACH_PER_TEMPERATURE, SPEED, WholeArmField
+from dt_viz.avoidance.arm_field import REACH_PER_TEMPERATURE, SPEED, WholeArmField
 from dt_viz.avoidance.arm_solver import MAX_DURATION, ROUNDING, SLOPE
 from dt_viz.avoidance.arm_solver import clearing as clearing_time
 from dt_viz.avoidance.avoidance import ArmAvoidance
@@ -21,7 +21,6 @@ from dt_viz.flows.diffeomorphisms import Conjugated, Diffeomorphism, Flow, Ident
 from dt_viz.flows.fields import Array
 from dt_viz.kernels.blocks import room_asked
 from dt_viz.obstacles.shapes import Obstacle
-from dt_viz.robot.robot import NUM_JOINTS
 
 NUM_COMPARED = 16
 """Number of colliding postures that escape directions are compared by, about; half of it where an obstacle moves, for
@@ -32,7 +31,6 @@ COARSE_STEP = 0.2
 """Length of a Runge–Kutta step, in flow time."""
 BEYOND = 0.03
 """Reach of the field beyond the margin, metres, at least."""
-NO_PINS = np.empty((0, NUM_JOINTS))
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +52,7 @@ class Clearing:
     def transform(self, arm: WholeArm, duration: float) -> Diffeomorphism:
         """ψ_q for a flow time, from the postures where the robot moves to those of its undisturbed motion."""
         if self.field is None or duration <= 0:
-            return Identity(NUM_JOINTS)
+            return Identity(arm.robot.num_joints)
         return Conjugated(Flow(self.field, duration, max(2, math.ceil(duration / COARSE_STEP))), arm.limits)
 
 
@@ -71,12 +69,12 @@ def clearing(
 
     Args:
         arm: whose body points are to be clear.
-        q: (N, 6) postures of the undisturbed motion that are to be clear, in their order, rad.
+        q: (N, n) postures of the undisturbed motion that are to be clear, in their order, rad.
         avoidance: what is to be avoided, and by how much.
         velocities: (P, 3) of the obstacles, m/s.
         before: whose escape directions are gone on with; those of obstacles that are not in the way any more are kept.
         turn: largest angle by which a direction turns away from that before, rad.
-        end: (6,) free posture beside which the clearance may be what it has itself; None is none.
+        end: (n,) free posture beside which the clearance may be what it has itself; None is none.
     """
     if avoidance is None or not avoidance.avoided.parts:
         return Clearing()
@@ -95,7 +93,7 @@ def clearing(
         return Clearing()
     obstacles, ways = zip(*met, strict=True)
     reach = max(REACH_PER_TEMPERATURE * avoidance.temperature, avoidance.margin + BEYOND)
-    field = WholeArmField(arm.robot, arm.body, obstacles, np.stack(ways), NO_PINS, reach)
+    field = WholeArmField(arm.robot, arm.body, obstacles, np.stack(ways), q[:0], reach)
 
     def lacking(p: Array, most: float) -> Array:
         return lack(arm, p, avoidance, end, most)
@@ -139,12 +137,12 @@ def _direction(
 
 
 def lack(arm: WholeArm, p: Array, avoidance: ArmAvoidance, end: Array | None, most: float) -> Array:
-    """Distances (N,), metres, by which postures p (N, 6) miss the clearance that is asked for, up to `most`.
+    """Distances (N,), metres, by which postures p (N, n) miss the clearance that is asked for, up to `most`.
 
-    That is the margin, or beside a free posture `end` (6,) that has less itself, what it has.
+    That is the margin, or beside a free posture `end` (n,) that has less itself, what it has.
     """
-    pins = NO_PINS if end is None else end[None]
+    pins = p[:0] if end is None else end[None]
     room = arm.clearance(pins, avoidance.avoided) - ROUNDING
     pins, room = pins[room > 0], room[room > 0]
-    asked = room_asked(np.array(p, order="C"), pins, room, LEVERS, SLOPE, float(avoidance.margin))
+    asked = room_asked(np.array(p, order="C"), pins, room, np.array(arm.robot.levers), SLOPE, float(avoidance.margin))
     return asked - arm.clearance(p, avoidance.avoided, asked + SPEED * STEP, asked - most)

@@ -90,7 +90,7 @@ class ControllerSettings:
     at_rest: float = 1e-3
     """Gap, rad, and velocity, rad/s, of joints that count as at rest."""
     aside: float = 5e-3
-    """Displacement, metres by `avoidance.arm_field.LEVERS`, from which on a robot at rest counts as having stepped
+    """Displacement, metres by `Robot.levers`, from which on a robot at rest counts as having stepped
     aside."""
     touching: float = 5e-3
     """Depth of a body point in an obstacle that counts as touching, metres."""

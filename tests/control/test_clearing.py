@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from dt_viz.avoidance.arm import BESIDE
-from dt_viz.avoidance.arm_field import LEVERS
 from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.control.clearing import Clearing, clearing
 from dt_viz.flows.fields import Array
@@ -61,7 +60,7 @@ def test_the_transform_is_a_bijection(arm, q):
     found, p = made(arm, q, around(arm, q[50]))
     assert np.abs(p - q).max() > 0.1
     there_and_back = found.transform(arm, found.duration).forward(p)
-    assert np.linalg.norm((there_and_back - q) * LEVERS, axis=1).max() < 3e-3
+    assert np.linalg.norm((there_and_back - q) * arm.robot.levers, axis=1).max() < 3e-3
 
 
 def test_nothing_near_or_nothing_to_avoid_changes_nothing(arm, q):

@@ -10,17 +10,15 @@ from pages import frame_of, ignored
 from scenes import avoiding, changed, frame_at
 from viser import transforms  # noqa: TID251
 
-from dt_viz.avoidance.arm_field import LEVERS
 from dt_viz.obstacles.shapes import Sphere
-from dt_viz.robot.body_points import load_body_points
 from dt_viz.robot.robot import load_jaco
 from dt_viz.scenario.panels import BASE_PANEL
 from dt_viz.scenario.scenario import View
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.engine import ArmMotion
 from dt_viz.session.frame import Stage
-from dt_viz.ui.scene.arm import NUM_ARMS, PEDESTAL, SEEN, ArmPicture, Arms, ArmSequence, arms_along
-from dt_viz.ui.scene.links import CELL, bodies, light_shells, simplified
+from dt_viz.ui.scene.arm import NUM_ARMS, SEEN, ArmPicture, Arms, ArmSequence, arms_along
+from dt_viz.ui.scene.links import CELL, bodies, simplified
 from dt_viz.ui.scene.palette import LIGHT
 from dt_viz.ui.scene.picture import Arrows, Lines, Look
 from dt_viz.ui.scene.rollouts import Rollouts
@@ -80,9 +78,10 @@ def test_a_simplified_mesh_stays_within_a_cell_of_the_original():
 
 
 def test_light_links_have_the_size_of_the_links():
-    for body, shell in zip(bodies(ROBOT.joint_names), light_shells(ROBOT.joint_names), strict=True):
-        assert len(shell.faces) < len(body.shell.faces) / 2
-        np.testing.assert_allclose(shell.bounds, body.shell.bounds, atol=CELL)
+    for body in bodies(ROBOT):
+        shell = body.parts[0][1]
+        assert len(body.light.faces) < len(shell.faces) / 2
+        np.testing.assert_allclose(body.light.bounds, shell.bounds, atol=CELL)
 
 
 # --- The scene ---
@@ -115,7 +114,7 @@ def test_arms_along_the_motion_stand_where_the_arm_would(scene):
     onion.visible = True  # drawn while hidden: it catches up
     for which, q in enumerate(arms_along(ROBOT, arm)):
         arms.pose(q, q)
-        for index, link in enumerate(onion.links, start=PEDESTAL):
+        for index, link in enumerate(onion.links, start=ROBOT.num_fixed + 1):
             pose = world_pose(arms.arm.frames, index)
             np.testing.assert_allclose(link.position + link.batched_positions[which], pose.translation(), atol=1e-6)
             turned = transforms.SO3(link.batched_wxyzs[which].astype(float)).as_matrix()
@@ -137,7 +136,7 @@ def test_arms_along_the_motion_send_nothing_while_hidden_and_follow_while_shown(
 
 
 def test_body_points_move_with_the_arm_and_lines_say_from_where(scene):
-    arms, points = Arms(scene, ROBOT), load_body_points()
+    arms, points = Arms(scene, ROBOT), load_jaco().body
     q, without = REACHING, REACHING - 0.2 * np.eye(6)[0]
     arms.pose(q, without)
     arms.show(View(body_points=True))  # posed while hidden: they catch up
@@ -345,7 +344,7 @@ def test_every_layer_has_a_checkbox():
 
 
 def test_a_joint_is_drawn_once_its_turn_is_seen(scene, robot):
-    arm, q, least = ArmPicture(scene, robot), robot.home + 0.3, SEEN / LEVERS
+    arm, q, least = ArmPicture(scene, robot), robot.home + 0.3, SEEN / robot.levers
 
     def drawn():
         return np.array([frame.wxyz for frame in arm.frames[1:]])
