@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from dt_viz.avoidance.arm_settings import WholeArmSettings
 from dt_viz.flows.diffeomorphisms import Diffeomorphism
 from dt_viz.flows.fields import Array, CompiledField
 from dt_viz.kernels import escape
@@ -29,25 +30,6 @@ DIFFERENCE = 1e-4
 POSTURE_DIFFERENCE = 1e-5
 """Step of those for the derivative of the field, rad."""
 
-REACH_PER_TEMPERATURE = 0.08 / 6
-"""Reach of an obstacle's field, metres, for each unit of the temperature T."""
-CORE = 0.5
-"""Depth at which the field has its full strength, as a part of the way from touching the obstacle to its middle; deeper
-inside the strength is constant, so the middle is not singular."""
-FAN = 4.0
-"""Distance of the source, from which escaping points fan out, behind the obstacle's middle, in the obstacle's radii."""
-BEHIND = 1.25
-"""Lower bound of that distance, in multiples of the field's outer radius, for no point may escape from the source."""
-DAMPING = 0.06
-"""Damping λ of the contact's pseudo-inverse, m/rad: contacts that joints can hardly move are not chased."""
-HAND_WEIGHT = 100.0
-"""Weight of the end effector's motion, rad²/m²: a contact of the forearm is resolved with the hand at rest."""
-PIN = 0.03
-"""Size of the region around a pinned posture in which the field fades out, metres by `Robot.levers`."""
-
-SPEED = 0.2
-"""Distance that a contact at full strength escapes in a unit of flow time, metres."""
-
 LIMIT_ZONE = 0.05
 """Width of the zone before a joint limit in which joints are held back, rad."""
 NEAREST_TO_LIMIT = 0.9
@@ -62,6 +44,11 @@ class ArmField(ABC):
     body: BodyPoints
     """Body points that can be moved away."""
     obstacles: tuple[Obstacle, ...]
+
+    @cached_property
+    def settings(self) -> WholeArmSettings:
+        """Settings for the arm."""
+        return WholeArmSettings.of(self.robot)
 
     @property
     def dim(self) -> int:
@@ -104,14 +91,15 @@ class WholeArmField(ArmField, CompiledField):
     """(K, 3) unit vectors in which the arm escapes from the obstacles."""
     pins: Array
     """(M, n) postures that do not move, rad."""
-    reach: float = 6 * REACH_PER_TEMPERATURE
+    reach: float
     """Distance from an obstacle's surface at which the field ends, metres."""
 
     @cached_property
     def _escape(self) -> escape.Escape:
         radius = np.array([obstacle.radius for obstacle in self.obstacles])
         depth = np.array([obstacle.depth for obstacle in self.obstacles])
-        behind = np.maximum(FAN * radius, BEHIND * (radius + self.reach + self.body.radius.max()))
+        settings = self.settings
+        behind = np.maximum(settings.fan * radius, settings.behind * (radius + self.reach + self.body.radius.max()))
         places = np.array([obstacle.position for obstacle in self.obstacles])
         shapes, values = records(self.obstacles)
         return escape.Escape(
@@ -122,15 +110,15 @@ class WholeArmField(ArmField, CompiledField):
             shapes=shapes,
             values=values,
             sources=places - behind[:, None] * self.directions,
-            cores=-CORE * (depth[:, None] + self.body.radius),
+            cores=-settings.core * (depth[:, None] + self.body.radius),
             reach=float(self.reach),
-            speed=SPEED,
-            damping=DAMPING,
+            speed=settings.speed,
+            damping=settings.damping,
             direction_weight=self.robot.tracking.direction_weight,
-            hand_weight=HAND_WEIGHT,
+            hand_weight=settings.hand_weight,
             pins=np.array(self.pins, dtype=float),
             levers=np.array(self.robot.levers),
-            pin=PIN,
+            pin=settings.pin,
         )
 
     def __call__(self, q: Array) -> Array:
@@ -151,7 +139,7 @@ class GradientField(ArmField):
     It moves start and goal, too, and ignores the motion of the hand. Those of several obstacles add up.
     """
 
-    reach: float = 6 * REACH_PER_TEMPERATURE
+    reach: float
     """Distance from the obstacle's surface at which the field ends, metres."""
 
     def __call__(self, q: Array) -> Array:
@@ -165,7 +153,7 @@ class GradientField(ArmField):
     def _force(self, obstacle: Obstacle, points: Array) -> Array:
         """Compute the forces (P, 3, N) of one obstacle on body points (P, 3, N): −30u²(1 − u)² times their way out."""
         distance = obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]
-        core = -CORE * (obstacle.depth + self.body.radius)[:, None]
+        core = -self.settings.core * (obstacle.depth + self.body.radius)[:, None]
         u = np.clip((self.reach - distance) / (self.reach - core), 0, 1)
         return -30 * (u * u * (1 - u) * (1 - u))[:, None] * _outward(obstacle, points)
 

@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from dt_viz.avoidance.arm_field import (
-    REACH_PER_TEMPERATURE,
-    SPEED,
     GradientField,
     JointLimits,
     WholeArmField,
 )
+from dt_viz.avoidance.arm_settings import WholeArmSettings
 from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.avoidance.clearing import Lack, clearing_duration
 from dt_viz.avoidance.detour import Detour
@@ -45,8 +45,6 @@ ROUNDING = 1e-3
 """Tolerance of a clearance, metres."""
 COARSE_STEP = 0.25
 """Length of a coarse RK4 step, in flow time: off by at most 1.2 mm at the hand in drags around Draw S and push box."""
-COARSE_SPACING = 0.025
-"""Largest distance between neighbouring samples of coarse motions, metres at the hand, about."""
 TOLERANCE = 3e-9
 """Tolerance of a step of the fine flow, rad."""
 LONG = 1.0
@@ -119,9 +117,13 @@ class Solver:
         self._margin = max(float(avoidance.margin), 2 * ROUNDING)
         self._room = body.clearance(robot, lifted.pins, avoidance.avoided, self._margin + ROUNDING) - ROUNDING
 
+    @cached_property
+    def _settings(self) -> WholeArmSettings:
+        return WholeArmSettings.of(self._robot)
+
     def _generated(self, met: Sequence[Detour]) -> VectorField | None:
         """The field whose flow takes these detours, with starts and goal at rest; None without any."""
-        reach = REACH_PER_TEMPERATURE * self._avoidance.temperature
+        reach = self._settings.reach_per_temperature * self._avoidance.temperature
         obstacles = tuple(detour.obstacle for detour in met)
         if not met:
             return None
@@ -216,7 +218,8 @@ class Solver:
         def integrated(index: Indices, fraction: Array) -> Array:
             return self._evaluate(transform, index, fraction)
 
-        return refined(bundle, integrated, max(self._spacing, COARSE_SPACING) if self._coarse else self._spacing)
+        spacing = max(self._spacing, self._settings.coarse_spacing) if self._coarse else self._spacing
+        return refined(bundle, integrated, spacing)
 
     def _lack(self, p: Array, most: float) -> Array:
         """Metres (N,), up to `most`, by which the arm at configurations (N, n) misses the clearance asked for."""
@@ -231,7 +234,7 @@ class Solver:
         """
         pins, levers = self._lifted.pins, np.array(self._robot.levers)
         asked = room_asked(np.array(p, order="C"), pins, self._room, levers, SLOPE, self._margin)
-        highest = asked + SPEED * SNAPSHOT
+        highest = asked + self._settings.speed * SNAPSHOT
         return asked, self._body.clearance(self._robot, p, self._avoidance.avoided, highest, asked - most)
 
     def _clearing_duration(self, p: Array) -> float:

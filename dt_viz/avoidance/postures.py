@@ -11,6 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
+from dt_viz.avoidance.arm_settings import WholeArmSettings
 from dt_viz.flows.fields import Array, Mask
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.union import Union
@@ -25,13 +26,6 @@ SPREAD = (0.2, 2.0)
 """Smallest and largest standard deviation of their joints from the usual posture, rad."""
 REACHED = 1e-4
 """Largest distance of the hand from a place that counts as reached, metres."""
-IN_THE_WAY = 10.0
-"""Cost of each metre that the mean motion lacks of the clearance that is asked for, against a metre from the usual
-postures."""
-ALIKE = 0.15
-"""Root mean square distance of postures, by `Robot.levers`, up to which reference postures are alike, metres."""
-AT_ENDS, ENDS = 40.0, 0.06
-"""Factor by which that costs more at the ends of the motion, and distance from them over which this fades, metres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,9 +47,10 @@ class ReferencePostures:
     @cached_property
     def _stuck(self) -> Array:
         """(K, T) weight of what is in the way on the path: near its ends, where no flow moves the arm, it is large."""
+        settings = WholeArmSettings.of(self.robot)
         ends = (self.on_path[:, [0, -1], None] - self.on_path[:, None]) * self.robot.levers
-        near = np.exp(-(ends**2).sum(axis=3) / (2 * ENDS**2)).max(axis=1)
-        return IN_THE_WAY * (1 + AT_ENDS * near)
+        near = np.exp(-(ends**2).sum(axis=3) / (2 * settings.ends**2)).max(axis=1)
+        return settings.in_the_way * (1 + settings.at_ends * near)
 
     def room(self, obstacle: Union | Obstacle, enough: float) -> Array:
         """Distances (K, R + 1), metres, of the arm from an obstacle at starts and goal, up to what is enough."""
@@ -68,7 +63,7 @@ class ReferencePostures:
     def alike(self, posture: int) -> Mask:
         """(K,) which postures are like one of them."""
         apart = (self.on_path - self.on_path[posture]) * self.robot.levers
-        return np.sqrt((apart**2).sum(axis=2).mean(axis=1)) < ALIKE
+        return np.sqrt((apart**2).sum(axis=2).mean(axis=1)) < WholeArmSettings.of(self.robot).alike
 
     def cost(self, obstacle: Union | Obstacle, asked: float) -> Array:
         """Costs (K,), metres, of the detour from the usual postures and of what lies in the way on the path.

@@ -73,7 +73,7 @@ class Section:
 
     def _slopes(self, q: Any) -> tuple[Array, Array]:  # noqa: ANN401, real or complex
         """Compute ∇h (N, n) and J (N, 3, n) at postures q (N, n), real or complex."""
-        chain, reference, settings = self.robot.chain(q.T), self.reference, self.robot.tracking
+        chain, reference, settings = self.robot.chain(q.T), self.reference, self.robot.sized_tracking
         excess = q - np.clip(q.real, *soft_limits(self.robot, reference))
         excess = np.where(excess.real == 0, 0, excess)
         turn = chain.direction - self.robot.hand_direction(reference)[:, None]

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dt_viz.avoidance.arm import BESIDE, WholeArm
-from dt_viz.avoidance.arm_field import REACH_PER_TEMPERATURE, SPEED, WholeArmField
+from dt_viz.avoidance.arm import WholeArm
+from dt_viz.avoidance.arm_field import WholeArmField
 from dt_viz.avoidance.arm_solver import MAX_DURATION, ROUNDING, SLOPE
 from dt_viz.avoidance.arm_solver import clearing as clearing_time
 from dt_viz.avoidance.avoidance import ArmAvoidance
@@ -21,6 +21,7 @@ from dt_viz.flows.diffeomorphisms import Conjugated, Diffeomorphism, Flow, Ident
 from dt_viz.flows.fields import Array
 from dt_viz.kernels.blocks import room_asked
 from dt_viz.obstacles.shapes import Obstacle
+from dt_viz.robot.sizing import sized
 
 NUM_COMPARED = 16
 """Number of colliding postures that escape directions are compared by, about; half of it where an obstacle moves, for
@@ -29,8 +30,6 @@ STEP = 0.05
 """Flow time between two looks at the clearance."""
 COARSE_STEP = 0.2
 """Length of a Runge–Kutta step, in flow time."""
-BEYOND = 0.03
-"""Reach of the field beyond the margin, metres, at least."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +82,7 @@ def clearing(
     chain = arm.robot.chain(q.T)
     points, tangents = arm.body.of_chain(chain), np.gradient(chain.position.T, axis=0) if len(q) > 1 else 0 * q[:, :3]
     tangents = tangents / np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
-    beside = max(BESIDE, avoidance.margin)  # that of what is fast may be wider
+    beside = max(arm.settings.beside, avoidance.margin)  # that of what is fast may be wider
     directions = tuple(
         _direction(arm, points, arm.clearance(q, part, beside), tangents, part, velocity, avoidance, way, turn)
         for part, velocity, way in zip(parts, velocities, known, strict=True)
@@ -92,7 +91,8 @@ def clearing(
     if not met:
         return Clearing()
     obstacles, ways = zip(*met, strict=True)
-    reach = max(REACH_PER_TEMPERATURE * avoidance.temperature, avoidance.margin + BEYOND)
+    settings = arm.settings
+    reach = max(settings.reach_per_temperature * avoidance.temperature, avoidance.margin + settings.beyond)
     field = WholeArmField(arm.robot, arm.body, obstacles, np.stack(ways), q[:0], reach)
 
     def lacking(p: Array, most: float) -> Array:
@@ -119,7 +119,7 @@ def _direction(
     near = np.flatnonzero(clearance < avoidance.margin)
     if not len(near):
         return before
-    bent = np.flatnonzero(clearance < max(BESIDE, avoidance.margin))
+    bent = np.flatnonzero(clearance < max(arm.settings.beside, avoidance.margin))
     num = NUM_COMPARED // 2 if velocity.any() else NUM_COMPARED
     compared = points[:, :, near[:: max(1, len(near) // num)]]
     escapes = escape_directions(
@@ -131,7 +131,7 @@ def _direction(
         num=1,
         velocity=velocity,
         previous=before,
-        settings=avoidance.detour,
+        settings=sized(avoidance.detour, arm.robot.size),
     )
     return escapes[0] if before is None else turned(before, escapes[0], turn, escapes)
 
@@ -145,4 +145,4 @@ def lack(arm: WholeArm, p: Array, avoidance: ArmAvoidance, end: Array | None, mo
     room = arm.clearance(pins, avoidance.avoided) - ROUNDING
     pins, room = pins[room > 0], room[room > 0]
     asked = room_asked(np.array(p, order="C"), pins, room, np.array(arm.robot.levers), SLOPE, float(avoidance.margin))
-    return asked - arm.clearance(p, avoidance.avoided, asked + SPEED * STEP, asked - most)
+    return asked - arm.clearance(p, avoidance.avoided, asked + arm.settings.speed * STEP, asked - most)

@@ -30,6 +30,7 @@ from dt_viz.motion.following import Follower
 from dt_viz.motion.solve import Solved
 from dt_viz.robot.inverse_kinematics import track
 from dt_viz.robot.robot import Robot
+from dt_viz.robot.sizing import sized
 
 
 class Phase(Enum):
@@ -85,7 +86,7 @@ class ArmController:
         Raises:
             UnreachableError: the arm cannot get to where the motions start.
         """
-        self.settings = settings = settings or ControllerSettings()
+        self.settings = settings = sized(settings or ControllerSettings(), follower.robot.size)
         self._follower, self._solved, self._lock = follower, solved, threading.RLock()
         self._section = Section(follower.robot, follower.reference(solved.nominal))
         self._flow = ObstacleFlow(follower.whole_arm, solved.scenario.arm_avoidance, settings)

@@ -23,8 +23,6 @@ STEADIEST = 0.5
 """Part of a distance that goes in one tick at most, however long it is."""
 JOINTS_BETWEEN = 3
 """Number of joints between two parts of the arm from which on they can touch: fewer do not fold them that far."""
-FASTEST = 1.3
-"""Speed, m/s, at which links approach the table at most, each joint at its limit; each other at 0.83."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +134,7 @@ class ContactLimit:
 
     def rows(self, q: Array, kept: Array, dt: float) -> tuple[Array, Array]:
         """Slopes s (K, n) and bounds b (K,) with s·q̇ ≥ b at q (n,) where distances (M,) are kept."""
-        reach = self.clearance + FASTEST / min(self.gain, STEADIEST / dt)
+        reach = self.clearance + self.robot.top_speed / min(self.gain, STEADIEST / dt)
         which, apart, slopes = contacts(self.robot.records, self.robot.body.spheres, self.pairs, q, reach)
         near, bounds = _barrier(apart - kept[which], slopes, self.gain, dt)
         return slopes[near], bounds

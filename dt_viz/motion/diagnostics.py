@@ -20,7 +20,6 @@ from dt_viz.robot.collision import Nearest
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import WHOLE_ARM
-from dt_viz.scenario.starts import REACH, SHOULDER
 from dt_viz.warning import ARM, Kind, MotionWarning, in_millimetres
 
 MAX_GOAL_MISS = 1e-3
@@ -75,17 +74,18 @@ def _of_arm(solved: Solved) -> list[MotionWarning]:
     return [*warnings, *start_warnings(beside, nominal.added, Kind.START_COVERED, how, WHOLE_ARM)]
 
 
-def anchor_warnings(stack: Solution) -> tuple[MotionWarning, ...]:
-    """Warnings about transforms that lead motions to where the arm's hand cannot be."""
+def anchor_warnings(stack: Solution, robot: Robot) -> tuple[MotionWarning, ...]:
+    """Warnings about transforms that lead motions to where a robot's hand cannot be."""
     said = []
     for name, transform in ((applied.name, applied.transform) for applied in stack.built):
         if not isinstance(transform, Anchored):
             continue
         if transform.position[2] < 0:
             said.append((name, "the point is below the table"))
-        away = float(np.linalg.norm(np.subtract(transform.position, SHOULDER)))
-        if away > REACH:
-            said.append((name, f"the point is {away:.2f} m from the arm's shoulder, which reaches {REACH:.2f} m"))
+        away = float(np.linalg.norm(np.subtract(transform.position, robot.shoulder)))
+        if not robot.reaches(transform.position):
+            reach = f"which reaches {robot.working_radius:.2f} m"
+            said.append((name, f"the point is {away:.2f} m from the arm's shoulder, {reach}"))
     return tuple(MotionWarning(Kind.MISPLACED, f"{name}: {text}", name) for name, text in said)
 
 

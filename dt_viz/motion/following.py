@@ -210,11 +210,11 @@ class Follower:
     def _pedestal_touched(self, learned: Learned, obstacle: Union) -> tuple[MotionWarning, ...]:
         """Warnings about what touches the links that no joint carries away."""
         posture, robot = self._demonstrated(learned).pins[:1], self.robot
-        if not robot.num_fixed or robot.pedestal.clearance(robot, posture, obstacle, 0.0) >= 0:
-            return ()
-        name = "base" if robot.body.of_joints(-1, 0).clearance(robot, posture, obstacle, 0.0) < 0 else "link 1"
-        text = f"the obstacle touches the arm's {name}, which cannot move away"
-        return (MotionWarning(Kind.ARM_BLOCKED, text, ARM),)
+        for joint, _ in robot.pedestal.by_joint:
+            if robot.body.of_joints(joint, joint + 1).clearance(robot, posture, obstacle, 0.0) < 0:
+                text = f"the obstacle touches the arm's {robot.link_name(joint)}, which cannot move away"
+                return (MotionWarning(Kind.ARM_BLOCKED, text, ARM),)
+        return ()
 
     def _ranked(
         self, learned: Learned, obstacle: Union, margin: float, last: Posture | None, *, keeps: bool

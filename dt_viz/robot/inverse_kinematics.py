@@ -68,10 +68,11 @@ def inverse_kinematics(
     Raises:
         UnreachableError: No start arrived. The message says by how much the best one missed.
     """
-    settings, target = robot.tracking, np.asarray(target, dtype=float)
+    settings, target = robot.sized_tracking, np.asarray(target, dtype=float)
     azimuth = np.arctan2(target[0], -target[1])  # 0 ahead of the base
     ready = robot.home.copy()
-    ready[0] -= azimuth
+    ready[0] += np.round(robot.joint_rotations[0, 2, 2]) * azimuth  # whichever way the first joint's axis points
+    ready = robot.clip(ready)
     if seed is None:
         reference = ready
         direction = np.array([np.sin(azimuth), -np.cos(azimuth), -np.tan(settings.hand_pitch)])
@@ -98,12 +99,10 @@ def inverse_kinematics(
     chain = robot.chain(q.T)
     miss = np.linalg.norm(chain.position - target[:, None], axis=0)
     if miss.min() > settings.tolerance:
-        shoulder = robot.joint_translations[0] + robot.joint_rotations[0] @ robot.joint_translations[1]
-        shoulder = np.round(shoulder, 2) + 0.0  # the sum turns -0 into 0
         raise UnreachableError(
             f"no configuration reaches {np.round(target, 3).tolist()} m: the nearest misses by {miss.min():.3f} m. "
-            f"The arm reaches at most {robot.reach:.2f} m from its shoulder at {shoulder.tolist()} m; "
-            f"the target is {np.linalg.norm(target - shoulder):.2f} m from it."
+            f"The arm reaches at most {robot.reach:.2f} m from its shoulder at {robot.shoulder.tolist()} m; "
+            f"the target is {np.linalg.norm(target - robot.shoulder):.2f} m from it."
         )
     excess = q - np.clip(q, posture.soft_lower, posture.soft_upper)
     cost = ((q - reference) ** 2 + settings.limit_weight * excess**2).sum(axis=1) / 2  # h(q) of `track`
@@ -159,7 +158,7 @@ def track(
     paths, starts = path.reshape(-1, *path.shape[-2:]), robot.clip(start.reshape(-1, robot.num_joints))
     references = starts if reference is None else _references(robot, reference, start.shape)
     posture = _posture(robot, references, robot.hand_direction(references), at_reference=True)
-    strides, each = [robot.tracking.stride, robot.tracking.stride / 4], np.arange(len(paths))
+    strides, each = [robot.sized_tracking.stride, robot.sized_tracking.stride / 4], np.arange(len(paths))
     if initial is None:
         guess = _walk(robot, paths, starts, posture, strides.pop(0))
     else:
@@ -191,7 +190,7 @@ def drawn_onto(robot: Robot, q: Array, positions: Array, reference: Array) -> Ar
     posture = _posture(robot, reference[None], robot.hand_direction(reference)[None], at_reference=True)
     begin, targets = np.array(q, order="C"), np.array(positions, order="C")
     return settle(
-        robot.tracking_arm, posture, begin, targets, np.zeros(len(q), int), 0, robot.tracking.final_sweeps, -1.0
+        robot.tracking_arm, posture, begin, targets, np.zeros(len(q), int), 0, robot.sized_tracking.final_sweeps, -1.0
     )
 
 
@@ -213,7 +212,7 @@ def _walk(robot: Robot, paths: Array, starts: Array, posture: Postures, stride: 
 
 def _swept(robot: Robot, q: Array, paths: Array, posture: Postures, which: NDArray[np.intp]) -> Array:
     """Step all waypoints until none moves; q (B, T, n), paths (B, T, 3), `which` (B,) of the postures they have."""
-    each, settings = np.repeat(which, paths.shape[1]), robot.tracking
+    each, settings = np.repeat(which, paths.shape[1]), robot.sized_tracking
     begin, targets = np.array(q.reshape(-1, robot.num_joints), order="C"), np.array(paths.reshape(-1, 3), order="C")
     limits = settings.max_sweeps, settings.final_sweeps, settings.step_tolerance
     return settle(robot.tracking_arm, posture, begin, targets, each, *limits).reshape(q.shape)
@@ -227,13 +226,13 @@ def _report(robot: Robot, q: Array, path: Array) -> TrackedPath:
         error=np.linalg.norm(chain.position.T.reshape(path.shape) - path, axis=-1),
         limits_hit=np.any((q <= robot.lower) | (q >= robot.upper), axis=-1),
         manipulability=manipulability,
-        damped=manipulability < robot.tracking.singular_manipulability,
+        damped=manipulability < robot.sized_tracking.singular_manipulability,
     )
 
 
 def soft_limits(robot: Robot, reference: Array, *, at_reference: bool = True) -> tuple[Array, Array]:
     """Find where the springs of references (*B, n) start: `at_reference` not before these, which are optima then."""
-    margin = robot.tracking.limit_margin
+    margin = robot.sized_tracking.limit_margin
     lower, upper = np.broadcast_arrays(robot.lower + margin, robot.upper - margin, reference)[:2]
     return (np.minimum(lower, reference), np.maximum(upper, reference)) if at_reference else (lower, upper)
 
@@ -242,7 +241,7 @@ def _posture(
     robot: Robot, reference: Array, direction: Array, weight: float | None = None, *, at_reference: bool = False
 ) -> Postures:
     """Make the posture of references (B, n); see `soft_limits`. None is the usual weight of the direction."""
-    weight = robot.tracking.direction_weight if weight is None else weight
+    weight = robot.sized_tracking.direction_weight if weight is None else weight
     soft_lower, soft_upper = soft_limits(robot, reference, at_reference=at_reference)
     arrays = reference, direction, soft_lower, soft_upper, np.full(len(reference), weight)
     return Postures(*(np.array(values, order="C") for values in arrays))
@@ -251,5 +250,5 @@ def _posture(
 def loses_branch(robot: Robot, q: Array, paths: Array) -> NDArray[np.bool_]:
     """Find which (B,) joints (B, T, n) jump by more than a continuous solution along paths (B, T, 3) can."""
     moved = np.linalg.norm(np.diff(paths, axis=1), axis=-1)
-    allowed = 0.05 + robot.tracking.jump_per_root_metre * np.sqrt(moved)  # the constant is for repeated samples
+    allowed = 0.05 + robot.sized_tracking.jump_per_root_metre * np.sqrt(moved)  # the constant is for repeated samples
     return np.any(np.abs(np.diff(q, axis=1)) > allowed[..., None], axis=(1, 2))

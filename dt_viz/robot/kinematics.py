@@ -16,6 +16,11 @@ if TYPE_CHECKING:
 
     from dt_viz.flows.fields import Array
 
+REFERENCE_REACH = 0.9851132221222917
+"""Reach of the JACO, metres, for which lengths that belong to an arm's size are given."""
+WORKING_RADIUS = 0.95
+"""Distance from the shoulder within which the JACO's hand gets anywhere, metres, about."""
+
 
 class KinematicChain(NamedTuple):
     """Forward kinematics with the batch last, where a rotation costs one matrix product for the whole batch."""
@@ -67,6 +72,26 @@ class Kinematics:
         """Length of the straightened arm from the second joint to the end effector, metres."""
         segments = np.vstack([self.joint_translations[2:], self.end_effector_offset])
         return float(np.linalg.norm(segments, axis=1).sum())
+
+    @property
+    def size(self) -> float:
+        """Reach, relative to the JACO's."""
+        return self.reach / REFERENCE_REACH
+
+    @property
+    def working_radius(self) -> float:
+        """Distance from the shoulder within which the hand gets anywhere, metres, about."""
+        return WORKING_RADIUS * self.size
+
+    @cached_property
+    def shoulder(self) -> Array:
+        """(3,) place of the second joint, about, to the centimetre, metres."""
+        place = self.joint_translations[0] + self.joint_rotations[0] @ self.joint_translations[1]
+        return np.round(place, 2) + 0.0  # the sum turns -0 into 0
+
+    def reaches(self, places: ArrayLike) -> NDArray[np.bool_]:
+        """Return which (*B,) of some places (*B, 3), metres, the hand gets to, about."""
+        return np.linalg.norm(places - self.shoulder, axis=-1) <= self.working_radius
 
     @cached_property
     def records(self) -> NDArray[np.void]:

@@ -13,12 +13,15 @@ import pinocchio as pin
 import yourdfpy
 
 from dt_viz.kernels.arm import BODY_POINT
+from dt_viz.kernels.blocks import MOST_JOINTS
 from dt_viz.kernels.proximity import least_contacts
 from dt_viz.kernels.tracking import TrackingArm
 from dt_viz.robot.body_points import BodyPoints
 from dt_viz.robot.collision import CollisionModel
 from dt_viz.robot.kinematics import Kinematics
+from dt_viz.robot.link_distances import page_names
 from dt_viz.robot.meshes import LinkMesh, VisualMesh
+from dt_viz.robot.sizing import sized
 from dt_viz.robot.tracking_settings import TrackingSettings
 from dt_viz.shipped import ASSETS
 
@@ -39,8 +42,8 @@ LEVERS = (0.5, 0.5, 0.35, 0.12, 0.14, 0.05)
 """Levers of the JACO's joints, m/rad."""
 RING = (62, 66, 74)
 """Colour of the JACO's rings."""
-REFERENCE_REACH = 0.9851132221222917
-"""Reach of the JACO, metres, for which lengths that belong to an arm's size are given."""
+LEAST_JOINTS = 3
+"""Smallest number of joints of an arm whose hand can be taken anywhere."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,12 +87,13 @@ class Robot(Kinematics):
     package_dirs: tuple[Path, ...]
     """Folders in which the `package://` addresses of its meshes resolve."""
     tracking: TrackingSettings = field(default=TrackingSettings())
-    """Settings of inverse kinematics and tracking."""
+    """Settings of inverse kinematics and tracking, their lengths for an arm as large as the JACO."""
 
-    @cached_property
-    def size(self) -> float:
-        """Reach in that of the JACO, whose lengths those of settings are."""
-        return self.reach / REFERENCE_REACH
+    def __post_init__(self) -> None:
+        """Raise ValueError for fewer joints than the hand has coordinates, or more than compiled loops take."""
+        if not LEAST_JOINTS <= self.num_joints <= MOST_JOINTS:
+            accepted = f"{LEAST_JOINTS} to {MOST_JOINTS} between base and hand"
+            raise ValueError(f"{self.name}: found {self.num_joints} joints; accepted: {accepted}")
 
     @cached_property
     def links(self) -> BodyPoints:
@@ -101,17 +105,34 @@ class Robot(Kinematics):
         """Body points of the base and the links that no motion moves away from anything."""
         return self.body.of_joints(-1, self.num_fixed)
 
+    def link_name(self, joint: int) -> str:
+        """Name on the page of the link that moves with a joint; −1 is the base."""
+        names = page_names([mesh.name for mesh in self.meshes])
+        return next((name for name, mesh in zip(names, self.meshes, strict=True) if mesh.joint == joint), "base")
+
     @cached_property
     def collision(self) -> CollisionModel:
         """The links as solids."""
         return CollisionModel(self, self.meshes, self.num_fixed, self.touching)
 
     @cached_property
+    def sized_tracking(self) -> TrackingSettings:
+        """These settings for this arm."""
+        return sized(self.tracking, self.size)
+
+    @cached_property
     def tracking_arm(self) -> TrackingArm:
         """The arm for the compiled loops of tracking."""
         arrays = (self.end_effector_offset, self.hand_axis, self.lower, self.upper)
-        weights = (getattr(self.tracking, name) for name in TrackingArm._fields[1 + len(arrays) :])
+        weights = (getattr(self.sized_tracking, name) for name in TrackingArm._fields[1 + len(arrays) :])
         return TrackingArm(self.records, *map(np.array, arrays), *weights)
+
+    @cached_property
+    def top_speed(self) -> float:
+        """Speed, m/s, that no point of the arm exceeds, stretched out and each joint at its limit."""
+        segments = np.vstack([self.joint_translations[1:], self.end_effector_offset])
+        lengths = np.cumsum(np.linalg.norm(segments, axis=1)[::-1])[::-1]
+        return float(lengths @ self.velocity_limits)
 
     def pairs(self, between: int) -> Indices:
         """Pairs (K, 2) of body points, by their own spheres, that may not touch.

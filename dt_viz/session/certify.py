@@ -36,7 +36,8 @@ def uncertified(motion: Solved, drawn: DrawnSamples, follower: Follower) -> Cert
     """What is known of a motion at once: its clearance, and what it does not get that it wants."""
     kept = motion.arm.clearance if motion.arm else clearance(motion, drawn, motion.scenario.obstacle, follower)
     found = motion_warnings(motion, drawn, follower.robot)
-    return Certificates(kept, found=(*found, *anchor_warnings(motion.stack), *target_warnings(motion, drawn)))
+    found += (*anchor_warnings(motion.stack, follower.robot), *target_warnings(motion, drawn))
+    return Certificates(kept, found=found)
 
 
 def clearance(motion: Solved, drawn: DrawnSamples, obstacle: Union, follower: Follower) -> float:

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scenes import changed
 
-from dt_viz.avoidance.arm import OPPOSED, WholeArm
-from dt_viz.avoidance.arm_solver import COARSE_SPACING, MAX_DURATION, ROUNDING, ArmSolution
+from dt_viz.avoidance.arm import WholeArm
+from dt_viz.avoidance.arm_settings import WholeArmSettings
+from dt_viz.avoidance.arm_solver import MAX_DURATION, ROUNDING, ArmSolution
 from dt_viz.avoidance.lift import Lift
 from dt_viz.flows.diffeomorphisms import Identity
 from dt_viz.metrics import resample_by_arc_length, sharpest_turn
@@ -130,7 +131,7 @@ class TestAroundTheMiddle:
 
     def test_neighbouring_samples_are_near(self, case, coarse):
         solution = case.avoiding(coarse=coarse)
-        spacing = COARSE_SPACING if coarse else FINE.spacing
+        spacing = WholeArmSettings().coarse_spacing if coarse else FINE.spacing
         for p, fraction in zip(split(solution, solution.p), split(solution, solution.fraction), strict=True):
             assert np.linalg.norm(np.diff(p * case.robot.levers, axis=0), axis=1).max() <= spacing
             assert (np.diff(fraction) > 0).all() and fraction[0] == 0 and fraction[-1] == 1
@@ -293,7 +294,7 @@ class TestTwoObstacles:
 
     def test_opposed_ways_out_of_what_one_posture_meets_become_one(self, push, pair):
         one, other = (self.first(push, ball)[0] for ball in pair)
-        assert one @ other < OPPOSED
+        assert one @ other < WholeArmSettings().opposed
         solution = push.avoiding(pair, coarse=True)
         first, second = solution.detours
         np.testing.assert_array_equal(first.side, second.side)
@@ -304,7 +305,7 @@ class TestTwoObstacles:
     def test_ways_out_that_are_alike_or_that_no_posture_meets_both_of_stay_as_they_are(self, push, pair, monkeypatch):
         x, y, z = pair[0].position
         for other, together in ((replace(pair[0], position=(x, y, z + 0.001)), 0.05), (pair[1], -1.0)):
-            monkeypatch.setattr("dt_viz.avoidance.arm.TOGETHER", together)
+            monkeypatch.setattr(push.arm, "settings", WholeArmSettings(together=together))
             alone = [self.first(push, ball)[0] for ball in (pair[0], other)]
             np.testing.assert_array_equal(self.first(push, pair[0], other), alone)
 

@@ -24,7 +24,7 @@ from laws.registry import (
 )
 from oracles import central_differences
 
-from dt_viz.avoidance.arm_field import CORE, GradientField, WholeArmField
+from dt_viz.avoidance.arm_field import GradientField, WholeArmField
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Flow
 from dt_viz.obstacles.shapes import Box, Sphere
 from dt_viz.robot.robot import HOME
@@ -51,7 +51,7 @@ def clearance(field, q):
 def occupancy(field, points, depth):
     """How far body points (*B, P, 3) are in an obstacle: 0 out of the field's reach, 1 at its core."""
     distance = field.obstacles[0].signed_distance(points) - field.body.radius
-    u = np.clip((field.reach - distance) / (field.reach + CORE * (depth + field.body.radius)), 0, 1)
+    u = np.clip((field.reach - distance) / (field.reach + field.settings.core * (depth + field.body.radius)), 0, 1)
     return 6 * u**5 - 15 * u**4 + 10 * u**3
 
 
@@ -121,7 +121,7 @@ class TestGradientField:
         return GradientField(ROBOT, BODY, (request.param,), REACH)
 
     def potential(self, field, q):
-        depth = field.reach + CORE * (field.obstacles[0].depth + BODY.radius)
+        depth = field.reach + field.settings.core * (field.obstacles[0].depth + BODY.radius)
         return (depth * occupancy(field, BODY.positions(ROBOT, q), field.obstacles[0].depth)).sum(axis=-1)
 
     def test_it_is_the_gradient_of_the_summed_occupancy(self, gradient):

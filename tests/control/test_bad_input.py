@@ -7,7 +7,7 @@ from scenes import changed
 
 from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.control.controller import ArmController, Phase
-from dt_viz.control.limits import FASTEST, ContactLimit
+from dt_viz.control.limits import ContactLimit
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.kernels.proximity import contacts, least_contacts
 from dt_viz.motion.stack import LIVE
@@ -162,7 +162,7 @@ def test_links_come_near_the_table_and_each_other_no_faster_than_is_reckoned_wit
         pairs = make(live.robot, 5e-3, 20.0).pairs
         found = [contacts(live.robot.records, body.spheres, pairs, q, 9.0) for q in postures]
         _, apart, slopes = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        assert (np.abs(slopes[apart > 0]) @ live.robot.velocity_limits).max() < FASTEST
+        assert (np.abs(slopes[apart > 0]) @ live.robot.velocity_limits).max() < live.robot.top_speed
 
 
 def test_distances_of_contacts_have_these_slopes(live):

@@ -278,7 +278,7 @@ def add_grid(session: Session) -> None:
     scenario, task = session.scenario, session.task
     arm_room = partial(room_at_rest, session.robot, task, scenario.obstacle)
     try:
-        grid = with_grid(scenario, task.slice.posed(scenario.view.slice), arm_room)
+        grid = with_grid(scenario, task.slice.posed(scenario.view.slice), arm_room, session.robot.reaches)
     except UnreachableError as error:
         session.say(f"the arm cannot reach the starts: {error}", Severity.WARNING)
         return
