@@ -128,12 +128,10 @@ class Robot(Kinematics):
         weights = (getattr(self.sized_tracking, name) for name in TrackingArm._fields[5:])
         return TrackingArm(self.records, hand, axis, lower, upper, *weights)
 
-    @cached_property
+    @property
     def top_speed(self) -> float:
-        """Speed, m/s, that no point of the arm exceeds, stretched out and each joint at its limit."""
-        segments = np.vstack([self.joint_translations[1:], self.end_effector_offset])
-        lengths = np.cumsum(np.linalg.norm(segments, axis=1)[::-1])[::-1]
-        return float(lengths @ self.velocity_limits)
+        """Largest speed of any point, m/s, each joint at its limit: a fifth more than by levers, which are means."""
+        return float(1.2 * self.levers @ self.velocity_limits)
 
     def pairs(self, between: int) -> Indices:
         """Pairs (K, 2) of body points, by their own spheres, that may not touch.
