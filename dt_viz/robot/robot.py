@@ -141,9 +141,10 @@ class Robot(Kinematics):
         """
         points, joint_of = self.body, {mesh.name: mesh.joint for mesh in self.meshes}
         may_touch = np.zeros((self.num_joints + 1, self.num_joints + 1), bool)  # the last one is the base, −1
-        for pair in self.touching:
-            first, second = (joint_of[name] for name in pair)
-            may_touch[first, second] = may_touch[second, first] = True
+        for first, second in self.touching:
+            if first in joint_of and second in joint_of:
+                a, b = joint_of[first], joint_of[second]
+                may_touch[a, b] = may_touch[b, a] = True
         apart = points.joint[:, None] + between <= points.joint
         a, b = np.nonzero(apart & ~may_touch[points.joint[:, None], points.joint])
         return points.indices[np.stack([a, b], axis=1)]
