@@ -16,7 +16,8 @@ from scipy.spatial import KDTree
 
 from dt_viz.obstacles.triangles import grid_nodes, inside_of_grid, surface_samples
 from dt_viz.robot.body_points import PROTRUSION
-from dt_viz.robot.robot import LinkMesh, collision_meshes
+from dt_viz.robot.meshes import LinkMesh
+from dt_viz.robot.robot import load_jaco
 
 FILE = Path(__file__).parent / "body_points.npz"
 SPACING = 1.5e-3  # metres, of points on the surface
@@ -35,7 +36,7 @@ Spheres = np.ndarray  # (N, 4): centre and radius, metres
 def body_points() -> dict[str, np.ndarray]:
     """The arrays of ``dt_viz.robot.body_points.BodyPoints``, by joint."""
     spheres, ends, joints, num = [], [], [], 0
-    for mesh in sorted(collision_meshes(), key=lambda mesh: mesh.joint):
+    for mesh in sorted(load_jaco().meshes, key=lambda mesh: mesh.joint):
         for cluster in _clusters(cover(mesh), max_radius(mesh)):
             nodes, sizes = _tree(cluster)
             spheres.append(nodes)

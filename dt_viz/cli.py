@@ -21,6 +21,7 @@ from dt_viz.ui.origins import Origin, OriginError
 
 if TYPE_CHECKING:
     from dt_viz.learning.store import FitStore
+    from dt_viz.robot.robot import Robot
     from dt_viz.scenario.tasks import Task
 
 MAX_PORT = 65535
@@ -53,6 +54,7 @@ def _serve(options: argparse.Namespace) -> int:
     from dt_viz.folders import default_cache_folder  # noqa: PLC0415
     from dt_viz.learning.imitation import ImitationError  # noqa: PLC0415
     from dt_viz.learning.store import FitStore  # noqa: PLC0415
+    from dt_viz.robot.robot import load_jaco  # noqa: PLC0415
     from dt_viz.scenario.tasks import known_tasks  # noqa: PLC0415
     from dt_viz.ui.patches import GateError  # noqa: PLC0415
     from dt_viz.ui.server import AddressError, Server  # noqa: PLC0415
@@ -65,17 +67,18 @@ def _serve(options: argparse.Namespace) -> int:
         if options.task not in tasks:
             print(f"{PROG}: --task: found {options.task!r}; accepted: {', '.join(tasks)}", file=sys.stderr)
             return 2
-        fits = FitStore(default_cache_folder())
+        fits, robot = FitStore(default_cache_folder()), load_jaco()
         first = tasks[options.task]()
         if options.prepare_all:
             for name in tasks:
                 task = tasks[name]()
                 fits.get(task.demonstrations, progress=_Bar(f"Learning {task.title}"))
                 print(f"Ready: {task.title}", flush=True)
-            _compile(threading.Event())
+            _compile(robot, threading.Event())
         server = Server(
             tasks,
             fits,
+            robot,
             task=options.task,
             host=options.host,
             port=options.port,
@@ -88,7 +91,7 @@ def _serve(options: argparse.Namespace) -> int:
     host = f"[{server.host}]" if ":" in server.host else server.host
     print(f"DT-Viz is at http://{host}:{server.port} (Ctrl-C stops it)", flush=True)
     leaving = threading.Event()
-    preparing = threading.Thread(target=_prepare, args=(fits, first, leaving), name="preparing")
+    preparing = threading.Thread(target=_prepare, args=(fits, first, robot, leaving), name="preparing")
     preparing.start()
     try:
         server.wait()
@@ -182,7 +185,7 @@ class _Bar:
             print()
 
 
-def _prepare(fits: FitStore, task: Task, leaving: threading.Event) -> None:
+def _prepare(fits: FitStore, task: Task, robot: Robot, leaving: threading.Event) -> None:
     """Learn the first task and compile what a drag repeats, beside the server, which answers meanwhile."""
     from dt_viz.errors import UnwantedError  # noqa: PLC0415
     from dt_viz.learning.imitation import ImitationError  # noqa: PLC0415
@@ -196,21 +199,19 @@ def _prepare(fits: FitStore, task: Task, leaving: threading.Event) -> None:
 
     try:
         fits.get(task.demonstrations, progress=progress)
-        _compile(leaving)
+        _compile(robot, leaving)
     except UnwantedError:
         pass
     except ImitationError as error:
         print(f"{PROG}: {error}", file=sys.stderr)
 
 
-def _compile(leaving: threading.Event) -> None:
+def _compile(robot: Robot, leaving: threading.Event) -> None:
     """Compile what a drag repeats: once for a processor, for half a minute; later it is only loaded."""
     from dt_viz.avoidance.arm import WholeArm  # noqa: PLC0415
-    from dt_viz.robot.body_points import load_body_points  # noqa: PLC0415
-    from dt_viz.robot.robot import load_jaco  # noqa: PLC0415
 
     began, bar = time.monotonic(), _Bar("Compiling for this processor, once")
-    for fraction in WholeArm(load_jaco(), load_body_points()).compiled():
+    for fraction in WholeArm(robot).compiled():
         if time.monotonic() - began > LOADED:
             bar(fraction)
         if leaving.is_set():

@@ -33,7 +33,6 @@ from scenes import avoiding, frame_at
 from dt_viz.avoidance.arm import WholeArm
 from dt_viz.learning.store import FitStore
 from dt_viz.obstacles.shapes import Sphere
-from dt_viz.robot.body_points import load_body_points
 from dt_viz.robot.robot import Robot, load_jaco
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.engine import Engine
@@ -52,7 +51,7 @@ settings.load_profile("dt-viz")
 def pytest_sessionstart(session):
     """Compile once what workers then load, so that no test takes as long as compiling does."""
     if getattr(session.config.option, "numprocesses", None):
-        list(WholeArm(load_jaco(), load_body_points()).compiled())
+        list(WholeArm(load_jaco()).compiled())
 
 
 @pytest.fixture(autouse=True)

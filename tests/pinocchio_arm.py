@@ -8,20 +8,21 @@ from functools import lru_cache
 import numpy as np
 import pinocchio as pin  # noqa: TID251, here it is the oracle
 
-from dt_viz.robot.robot import NUM_JOINTS, Robot, package_folder, urdf_path
+from dt_viz.robot.robot import Robot, load_jaco
 
 
 def random_configurations(robot: Robot, seed: int, shape: tuple[int, ...]) -> np.ndarray:
     lower, upper = np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, 2 * np.pi)
-    return np.random.default_rng(seed).uniform(lower, upper, (*shape, NUM_JOINTS))
+    return np.random.default_rng(seed).uniform(lower, upper, (*shape, robot.num_joints))
 
 
 @lru_cache(maxsize=1)
 def pinocchio_model() -> tuple:
     """The model, its collision shapes and what is computed of both; of the pairs of links those that may touch."""
-    path = str(urdf_path())
+    robot = load_jaco()
+    path, folders = str(robot.urdf), list(map(str, robot.package_dirs))
     model = pin.buildModelFromUrdf(path)
-    shapes = pin.buildGeomFromUrdf(model, path, pin.GeometryType.COLLISION, package_dirs=[str(package_folder())])
+    shapes = pin.buildGeomFromUrdf(model, path, pin.GeometryType.COLLISION, package_dirs=folders)
     for a, first in enumerate(shapes.geometryObjects):
         for b, second in enumerate(shapes.geometryObjects):
             if second.parentJoint - first.parentJoint > 1:

@@ -10,7 +10,7 @@ import dt_viz as dt
 from dt_viz.examples import arm_controller, controller, plot
 from dt_viz.examples.viser_scene import Scene
 from dt_viz.library.motion import Motion
-from dt_viz.robot.collision import load_collision_model
+from dt_viz.robot.robot import load_jaco
 from dt_viz.shipped import ASSETS
 from dt_viz.warning import Kind
 
@@ -61,7 +61,7 @@ def test_the_whole_arm_avoids_what_the_joints_are_told_to(push):
     around = push.stack(dt.Avoidance(ball, space="cspace"))
     for path, before in zip(around.rollouts(), push.rollouts(), strict=True):
         np.testing.assert_array_equal(path.positions, before.positions)  # the hand's own motion is not changed
-    model, goal = load_collision_model(), push.goal
+    model, goal = load_jaco().collision, push.goal
     follows = [arm.follow(path) for path in push.rollouts()]
     assert min(model.nearest_to_obstacle(joints.q, ball).distance for joints in follows) < 0
     motions = arm.rollouts(around)
@@ -217,7 +217,7 @@ def test_the_scene_draws_its_paths_around_the_ball_where_it_stands(server, push)
 
 
 def test_the_arm_in_the_loop_gives_way_to_a_ball_that_crosses_and_arrives(push):
-    arm, model = dt.load_jaco(), load_collision_model()
+    arm, model = dt.load_jaco(), load_jaco().collision
     joints, places = arm_controller.run(push, arm)
     pairs = list(zip(joints, places, strict=True))[::10]
     balls = [dt.Sphere((x, y, z), diameter=0.15) for _, (x, y, z) in pairs]

@@ -24,14 +24,13 @@ PATIENCE = 300.0
 """Seconds that anything may take: the machine may be busy."""
 EVERYTHING = """
 import pkgutil, dt_viz
-from dt_viz.robot.body_points import load_body_points
 from dt_viz.scenario.tasks import TASKS
 for module in pkgutil.walk_packages(dt_viz.__path__, "dt_viz."):
     if not module.name.endswith("_training"):  # these need the extra "baselines"
         __import__(module.name)
 for task in TASKS.values():
     task()
-load_body_points()
+load_jaco().body
 print(dt_viz.__file__)
 """
 """Imports every module, and reads every file that ships."""

@@ -2,7 +2,7 @@
 
 The joints follow the end effector by the pseudo-inverse: q(t) = Q(x(t)) with one section Q for all rollouts of a task
 (`robot.inverse_kinematics.track` with a shared reference). It does not depend on the obstacle, so it is computed once;
-a drag costs p(t) = ψ_q⁻¹(q(t)) only, one batched flow in R⁶.
+a drag costs p(t) = ψ_q⁻¹(q(t)) only, one batched flow in Rⁿ.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from dt_viz.avoidance.arm_field import LEVERS, JointLimits, WholeArmField
+from dt_viz.avoidance.arm_field import JointLimits, WholeArmField
+from dt_viz.avoidance.arm_settings import WholeArmSettings
 from dt_viz.avoidance.arm_solver import MAX_DURATION, ROUNDING, SLOPE, ArmSolution, Solver
 from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.avoidance.detour import Detour, carried_over, escape_directions
@@ -27,53 +28,45 @@ from dt_viz.kernels.proximity import contacts, least_contacts, proximity
 from dt_viz.kernels.splines import cubics
 from dt_viz.obstacles.shapes import Obstacle, Sphere, records
 from dt_viz.obstacles.union import Union
-from dt_viz.robot.body_points import BodyPoints
 from dt_viz.robot.inverse_kinematics import track
-from dt_viz.robot.robot import NUM_JOINTS, Robot
+from dt_viz.robot.robot import Robot
+from dt_viz.robot.sizing import sized
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 NUM_COMPARED = 60
 """Colliding samples that escapes are compared by."""
-DURATION_CHANGE = 50.0
-"""Largest change of the flow time for each metre that an obstacle is dragged: contacts move by 1 cm a millimetre."""
 NUM_ESCAPES = 3
 """Largest number of escapes from each obstacle that are tried."""
-TOGETHER, OPPOSED = 0.05, -0.5
-"""Clearance from another obstacle, metres, up to which a colliding posture meets both, and cosine of the angle between
-their escapes beyond which both are left in one direction."""
-BESIDE = 0.20
-"""Clearance up to which a sample is bent along with the colliding ones, metres."""
 
 
 class WholeArm:
     """Makes the arm's motions clear an obstacle, by a diffeomorphism of configuration space."""
 
-    def __init__(self, robot: Robot, body: BodyPoints) -> None:
+    def __init__(self, robot: Robot) -> None:
         self.robot = robot
-        self.links = body.on_moving_links
-        """Points of the links."""
-        self.body = self.links.with_end_effector(robot)
-        """The same, and what the hand holds."""
+        self.body = robot.links.with_end_effector(robot)
+        """Body points of the links, and what the hand holds."""
+        self.settings = WholeArmSettings.of(robot)
         self.limits = JointLimits(robot.lower, robot.upper)
         self._solver = partial(Solver, robot, self.body, self.limits)
 
     def compiled(self) -> Iterator[float]:
         """Compile what a drag repeats for this processor, or load what was compiled before; yields the part done."""
-        q, obstacle = self.robot.home[None], Sphere((0.0, 0.0, 0.0))
-        field = WholeArmField(self.robot, self.body, (obstacle,), np.eye(3)[:1], np.empty((0, NUM_JOINTS)))
-        points = self.body.of_chain(self.robot.chain(q.T))
+        robot, q, obstacle = self.robot, self.robot.home[None], Sphere((0.0, 0.0, 0.0))
+        field = WholeArmField(robot, self.body, (obstacle,), np.eye(3)[:1], q[:0], 0.1)
+        points = self.body.of_chain(robot.chain(q.T))
         shapes, values = records((obstacle,))
-        joints, links, still = self.robot.records, self.links.spheres, np.zeros(NUM_JOINTS)
+        joints, links, still = robot.records, robot.links.spheres, np.zeros(robot.num_joints)
         dodging, ones = LimitedArm(joints, links, still, still, still, 1.0), np.ones((1, 1))
         forecast = Forecast(shapes, values, np.ones(1), np.ones((1, 1, 3)), ones, 0.0, 0.0, 1.0)
         calls: tuple[Callable[[], object], ...] = (
-            lambda: self.robot.end_effector(q),
+            lambda: robot.end_effector(q),
             lambda: self.clearance(q, obstacle),
-            lambda: track(self.robot, self.robot.end_effector(q)[:, None], q, reference=q),
-            lambda: cubics(np.arange(4.0)[None], np.zeros((1, 4, NUM_JOINTS))),
-            lambda: room_asked(q, q, np.zeros(1), LEVERS, SLOPE, 0.0),
+            lambda: track(robot, robot.end_effector(q)[:, None], q, reference=q),
+            lambda: cubics(np.arange(4.0)[None], np.zeros((1, 4, robot.num_joints))),
+            lambda: room_asked(q, q, np.zeros(1), np.array(robot.levers), SLOPE, 0.0),
             lambda: proximity(joints, links, shapes, values, q[0].copy(), 1.0),
             lambda: contacts(joints, links, np.array([[-1, 0]]), q[0].copy(), 1.0),
             lambda: least_contacts(joints, links, np.array([[-1, 0]]), q.copy(), 1.0),
@@ -113,7 +106,7 @@ class WholeArm:
             lifted: the motions below.
             avoidance: what is to be avoided, and how.
             spacing: largest distance between neighbouring samples, metres at the hand, about; in coarse motions it is
-                `COARSE_SPACING` if that is more.
+                `WholeArmSettings.coarse_spacing` if that is more.
             coarse: whether the flow is integrated for the eye only, in a few equal steps.
             passing: detours to keep while obstacles are dragged.
         """
@@ -151,7 +144,8 @@ class WholeArm:
         failed = not passing.cleared and passing.duration >= MAX_DURATION
         attempts = [int(failed and last is not None and last.arrived) for last in known]
         detours = _detours(avoidance, self._sides(lifted, avoidance, known), known, attempts)
-        change = DURATION_CHANGE * max((last.travelled or 0.0 for last in known if last is not None), default=0.0)
+        travelled = max((last.travelled or 0.0 for last in known if last is not None), default=0.0)
+        change = self.settings.duration_change * travelled
         between = max(passing.duration - change, 0.0), min(passing.duration + change, MAX_DURATION)
         return self._solver(lifted, avoidance, detours, spacing, between=between).solution()
 
@@ -194,10 +188,11 @@ class WholeArm:
         flows would hold each other up, and motions turn back between them.
         """
         q, parts, margin = lifted.tracked.q[lifted.shaping], avoidance.avoided.parts, avoidance.margin
-        beside = max(BESIDE, margin)
+        settings, detour = self.settings, sized(avoidance.detour, self.robot.size)
+        beside = max(settings.beside, margin)
         tangents = np.gradient(self.robot.end_effector(q), axis=1).reshape(-1, 3)
         tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
-        q = q.reshape(-1, NUM_JOINTS)
+        q = q.reshape(-1, q.shape[-1])
         near: Mask = np.array([self.clearance(q, part, margin, margin - ROUNDING) < margin for part in parts])
         near = near.reshape(len(parts), len(q))
         clearance = np.array([self.body.outermost.clearance(self.robot, q, part, beside) for part in parts])  # about
@@ -215,7 +210,7 @@ class WholeArm:
                 Union(tuple(parts[k] for k in which)),
                 margin,
                 num=NUM_ESCAPES,
-                settings=avoidance.detour,
+                settings=detour,
                 previous=next((last.side for last in (known[k] for k in which) if last is not None), None),
             )
 
@@ -225,8 +220,8 @@ class WholeArm:
             sides[k] = escapes(np.array([k]))
         if len(met) > 1:
             first = np.array([sides[k][0] for k in met])
-            together = (near[met, None] & (clearance[met] < TOGETHER)).any(axis=2)
-            num_groups, group = connected_components(together & (first @ first.T < OPPOSED), directed=False)
+            together = (near[met, None] & (clearance[met] < settings.together)).any(axis=2)
+            num_groups, group = connected_components(together & (first @ first.T < settings.opposed), directed=False)
             for which in (met[group == k] for k in range(num_groups)):
                 if len(which) > 1:
                     shared = escapes(which)

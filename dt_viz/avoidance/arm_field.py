@@ -1,7 +1,7 @@
 """Whole-arm avoidance: diffeomorphisms of configuration space (sec. 4.5).
 
-A configuration is six joint angles, rad. `WholeArmField` is a generator V_q on R⁶ whose reverse flow carries the arm
-out of an obstacle; `JointLimits` bends R⁶ so that no flow leaves the joint limits.
+A configuration is n joint angles, rad. `WholeArmField` is a generator V_q on Rⁿ whose reverse flow carries the arm
+out of an obstacle; `JointLimits` bends Rⁿ so that no flow leaves the joint limits.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from dt_viz.avoidance.arm_settings import WholeArmSettings
 from dt_viz.flows.diffeomorphisms import Diffeomorphism
 from dt_viz.flows.fields import Array, CompiledField
 from dt_viz.kernels import escape
@@ -20,33 +21,13 @@ from dt_viz.kernels.dormand_prince import RATE
 from dt_viz.kernels.joint_limits import stretched
 from dt_viz.obstacles.shapes import Obstacle, records
 from dt_viz.robot.body_points import BodyPoints
-from dt_viz.robot.robot import NUM_JOINTS, Robot, cross
+from dt_viz.robot.kinematics import cross
+from dt_viz.robot.robot import Robot
 
 DIFFERENCE = 1e-4
 """Step of the finite differences for the slope of an obstacle's distance, metres."""
 POSTURE_DIFFERENCE = 1e-5
 """Step of those for the derivative of the field, rad."""
-
-REACH_PER_TEMPERATURE = 0.08 / 6
-"""Reach of an obstacle's field, metres, for each unit of the temperature T."""
-CORE = 0.5
-"""Depth at which the field has its full strength, as a part of the way from touching the obstacle to its middle; deeper
-inside the strength is constant, so the middle is not singular."""
-FAN = 4.0
-"""Distance of the source, from which escaping points fan out, behind the obstacle's middle, in the obstacle's radii."""
-BEHIND = 1.25
-"""Lower bound of that distance, in multiples of the field's outer radius, for no point may escape from the source."""
-DAMPING = 0.06
-"""Damping λ of the contact's pseudo-inverse, m/rad: contacts that joints can hardly move are not chased."""
-HAND_WEIGHT = 100.0
-"""Weight of the end effector's motion, rad²/m²: a contact of the forearm is resolved with the hand at rest."""
-LEVERS = np.array([0.5, 0.5, 0.35, 0.12, 0.14, 0.05])
-"""Approximate motion of the hand for each joint's turning, m/rad: converts a distance of postures to a length."""
-PIN = 0.03
-"""Size of the region around a pinned posture in which the field fades out, metres of that distance."""
-
-SPEED = 0.2
-"""Distance that a contact at full strength escapes in a unit of flow time, metres."""
 
 LIMIT_ZONE = 0.05
 """Width of the zone before a joint limit in which joints are held back, rad."""
@@ -56,27 +37,33 @@ NEAREST_TO_LIMIT = 0.9
 
 @dataclass(frozen=True, eq=False)
 class ArmField(ABC):
-    """Base of the generators V_q on R⁶ of an arm and obstacles."""
+    """Base of the generators V_q on Rⁿ of an arm and obstacles."""
 
     robot: Robot
     body: BodyPoints
     """Body points that can be moved away."""
     obstacles: tuple[Obstacle, ...]
 
+    @cached_property
+    def settings(self) -> WholeArmSettings:
+        """Settings for the arm."""
+        return WholeArmSettings.of(self.robot)
+
     @property
     def dim(self) -> int:
         """Dimension of configuration space."""
-        return NUM_JOINTS
+        return self.robot.num_joints
 
     @abstractmethod
     def __call__(self, q: Array) -> Array:
-        """Compute V_q at configurations `q` (N, 6), as (N, 6)."""
+        """Compute V_q at configurations `q` (N, n), as (N, n)."""
 
     def with_jacobian(self, q: Array) -> tuple[Array, Array]:
-        """Compute V_q (N, 6) and DV_q (N, 6, 6), by differences of fourth order, at configurations `q` (N, 6)."""
-        steps = POSTURE_DIFFERENCE * np.array([1, -1, 2, -2])[:, None, None] * np.eye(NUM_JOINTS)
-        shifted = (q[:, None, None] + steps).reshape(-1, NUM_JOINTS)
-        near, before, far, behind = np.moveaxis(self(shifted).reshape(len(q), 4, NUM_JOINTS, NUM_JOINTS), 1, 0)
+        """Compute V_q (N, n) and DV_q (N, n, n), by differences of fourth order, at configurations `q` (N, n)."""
+        num, n = q.shape
+        steps = POSTURE_DIFFERENCE * np.array([1, -1, 2, -2])[:, None, None] * np.eye(n)
+        shifted = (q[:, None, None] + steps).reshape(-1, n)
+        near, before, far, behind = np.moveaxis(self(shifted).reshape(num, 4, n, n), 1, 0)
         slopes = (8 * (near - before) - (far - behind)) / (12 * POSTURE_DIFFERENCE)
         return self(q), slopes.transpose(0, 2, 1)
 
@@ -102,37 +89,39 @@ class WholeArmField(ArmField, CompiledField):
     directions: Array
     """(K, 3) unit vectors in which the arm escapes from the obstacles."""
     pins: Array
-    """(M, 6) postures that do not move, rad."""
-    reach: float = 6 * REACH_PER_TEMPERATURE
+    """(M, n) postures that do not move, rad."""
+    reach: float
     """Distance from an obstacle's surface at which the field ends, metres."""
 
     @cached_property
     def _escape(self) -> escape.Escape:
         radius = np.array([obstacle.radius for obstacle in self.obstacles])
         depth = np.array([obstacle.depth for obstacle in self.obstacles])
-        behind = np.maximum(FAN * radius, BEHIND * (radius + self.reach + self.body.radius.max()))
+        settings = self.settings
+        behind = np.maximum(settings.fan * radius, settings.behind * (radius + self.reach + self.body.radius.max()))
         places = np.array([obstacle.position for obstacle in self.obstacles])
         shapes, values = records(self.obstacles)
         return escape.Escape(
             joints=self.robot.records,
             points=self.body.outermost.spheres,
             hand=np.array(self.robot.end_effector_offset),
+            axis=np.array(self.robot.hand_axis),
             shapes=shapes,
             values=values,
             sources=places - behind[:, None] * self.directions,
-            cores=-CORE * (depth[:, None] + self.body.radius),
+            cores=-settings.core * (depth[:, None] + self.body.radius),
             reach=float(self.reach),
-            speed=SPEED,
-            damping=DAMPING,
+            speed=settings.speed,
+            damping=settings.damping,
             direction_weight=self.robot.tracking.direction_weight,
-            hand_weight=HAND_WEIGHT,
+            hand_weight=settings.hand_weight,
             pins=np.array(self.pins, dtype=float),
-            levers=np.array(LEVERS),
-            pin=PIN,
+            levers=np.array(self.robot.levers),
+            pin=settings.pin,
         )
 
     def __call__(self, q: Array) -> Array:
-        """Compute V_q at configurations `q` (N, 6), as (N, 6)."""
+        """Compute V_q at configurations `q` (N, n), as (N, n)."""
         return self.carried(q, RATE)
 
     def carried(self, s: Array, method: int, duration: float = 0.0, steps: int = 1, tolerance: float = 0.0) -> Array:
@@ -149,11 +138,11 @@ class GradientField(ArmField):
     It moves start and goal, too, and ignores the motion of the hand. Those of several obstacles add up.
     """
 
-    reach: float = 6 * REACH_PER_TEMPERATURE
+    reach: float
     """Distance from the obstacle's surface at which the field ends, metres."""
 
     def __call__(self, q: Array) -> Array:
-        """Compute V_q at configurations `q` (N, 6), as (N, 6)."""
+        """Compute V_q at configurations `q` (N, n), as (N, n)."""
         chain = self.robot.chain(q.T)
         points = self.body.of_chain(chain)
         force: Any = sum(self._force(obstacle, points) for obstacle in self.obstacles)
@@ -163,18 +152,19 @@ class GradientField(ArmField):
     def _force(self, obstacle: Obstacle, points: Array) -> Array:
         """Compute the forces (P, 3, N) of one obstacle on body points (P, 3, N): −30u²(1 − u)² times their way out."""
         distance = obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]
-        core = -CORE * (obstacle.depth + self.body.radius)[:, None]
+        core = -self.settings.core * (obstacle.depth + self.body.radius)[:, None]
         u = np.clip((self.reach - distance) / (self.reach - core), 0, 1)
         return -30 * (u * u * (1 - u) * (1 - u))[:, None] * _outward(obstacle, points)
 
     def _beyond(self, values: Array) -> Array:
-        """Sum `values` (P, 3, N), for each joint over the points that it moves, (6, 3, N)."""
-        return (self.body.is_beyond @ values.reshape(len(values), -1)).reshape(NUM_JOINTS, *values.shape[1:])
+        """Sum `values` (P, 3, N), for each joint over the points that it moves, (n, 3, N)."""
+        moves = (self.body.joint >= np.arange(self.dim)[:, None]).astype(float)
+        return (moves @ values.reshape(len(values), -1)).reshape(self.dim, *values.shape[1:])
 
 
 @dataclass(frozen=True, eq=False)
 class JointLimits(Diffeomorphism):
-    """Map from the configurations inside the joint limits onto R⁶: flows there correspond to flows inside the limits.
+    """Map from the configurations inside the joint limits onto Rⁿ: flows there correspond to flows inside the limits.
 
     With e the depth of a joint in the zone of width m before its limit, ψ⁻¹ is the flow of ė = −e³ for the time
     1/(2m²), which carries joints away from their limits:
@@ -185,9 +175,9 @@ class JointLimits(Diffeomorphism):
     """
 
     lower: Array
-    """(6,) rad, −inf for continuous joints."""
+    """(n,) rad, −inf for continuous joints."""
     upper: Array
-    """(6,) rad, +inf for continuous joints."""
+    """(n,) rad, +inf for continuous joints."""
     zone: float = LIMIT_ZONE
     """m, rad."""
     fraction: float = 1.0
@@ -203,7 +193,7 @@ class JointLimits(Diffeomorphism):
         return replace(self, fraction=fraction * self.fraction)
 
     def inside(self, q: Array) -> Array:
-        """Clip configurations (*B, 6) to a little less than the limits, where ψ is finite."""
+        """Clip configurations (*B, n) to a little less than the limits, where ψ is finite."""
         slack = (1 - NEAREST_TO_LIMIT) * self.zone
         return np.minimum(np.maximum(q, self.lower + slack), self.upper - slack)
 

@@ -5,17 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from dt_viz.avoidance.arm_field import (
-    LEVERS,
-    REACH_PER_TEMPERATURE,
-    SPEED,
     GradientField,
     JointLimits,
     WholeArmField,
 )
+from dt_viz.avoidance.arm_settings import WholeArmSettings
 from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.avoidance.clearing import Lack, clearing_duration
 from dt_viz.avoidance.detour import Detour
@@ -25,7 +24,7 @@ from dt_viz.flows.fields import Array, Indices, Mask, VectorField
 from dt_viz.flows.rollouts import Bundle, refined
 from dt_viz.kernels.blocks import room_asked
 from dt_viz.robot.body_points import BodyPoints
-from dt_viz.robot.robot import NUM_JOINTS, Robot
+from dt_viz.robot.robot import Robot
 
 NUM_COARSE = 40
 """Number of samples of each rollout of coarse motions, before refinement."""
@@ -46,8 +45,6 @@ ROUNDING = 1e-3
 """Tolerance of a clearance, metres."""
 COARSE_STEP = 0.25
 """Length of a coarse RK4 step, in flow time: off by at most 1.2 mm at the hand in drags around Draw S and push box."""
-COARSE_SPACING = 0.025
-"""Largest distance between neighbouring samples of coarse motions, metres at the hand, about."""
 TOLERANCE = 3e-9
 """Tolerance of a step of the fine flow, rad."""
 LONG = 1.0
@@ -65,9 +62,9 @@ class ArmSolution:
     fraction: Array
     """(N,) where on its base ray it is."""
     q: Array
-    """(N, 6) without avoidance, rad."""
+    """(N, n) without avoidance, rad."""
     p: Array
-    """(N, 6) the motion, rad."""
+    """(N, n) the motion, rad."""
     duration: float
     """t of the avoidance flow."""
     clearance: float
@@ -120,9 +117,13 @@ class Solver:
         self._margin = max(float(avoidance.margin), 2 * ROUNDING)
         self._room = body.clearance(robot, lifted.pins, avoidance.avoided, self._margin + ROUNDING) - ROUNDING
 
+    @cached_property
+    def _settings(self) -> WholeArmSettings:
+        return WholeArmSettings.of(self._robot)
+
     def _generated(self, met: Sequence[Detour]) -> VectorField | None:
         """The field whose flow takes these detours, with starts and goal at rest; None without any."""
-        reach = REACH_PER_TEMPERATURE * self._avoidance.temperature
+        reach = self._settings.reach_per_temperature * self._avoidance.temperature
         obstacles = tuple(detour.obstacle for detour in met)
         if not met:
             return None
@@ -139,44 +140,44 @@ class Solver:
             duration = 0.0
         elif duration is None:
             shaping = self._lifted.tracked.q[self._lifted.shaping]
-            q = self._limits.inside(shaping[:, ::STRIDE].reshape(-1, NUM_JOINTS))
+            q = self._limits.inside(shaping[:, ::STRIDE].reshape(-1, self._robot.num_joints))
             duration = self._clearing_duration(q)
         return self._with_duration(float(np.clip(duration, *self._between)))
 
     def _with_duration(self, duration: float) -> ArmSolution:
         transform = self._transform(duration)
         bundle = self._sampled(transform)
-        asked, kept = self._clearances(bundle.positions / LEVERS)
+        asked, kept = self._clearances(bundle.positions / self._robot.levers)
         automatic, longest = self._generator is not None and self._avoidance.duration is None, self._between[1]
         for _ in range(MAX_ROUNDS if automatic else 0):
             lacking = self._shaping(bundle) & (asked > kept)
             if duration >= longest or (asked - kept)[lacking].max(initial=0.0) <= ROUNDING:
                 break
-            p = bundle.positions[lacking] / LEVERS
+            p = bundle.positions[lacking] / self._robot.levers
             more = min(self._clearing_duration(p), longest - duration)
             duration += more
             bundle, transform = self._continued(bundle, more, duration)
-            asked, kept = self._clearances(bundle.positions / LEVERS)
+            asked, kept = self._clearances(bundle.positions / self._robot.levers)
         return self._along(bundle, transform, duration, asked, kept)
 
     def _continued(self, bundle: Bundle, more: float, duration: float) -> tuple[Bundle, Diffeomorphism]:
         """The samples carried on by the flow, by `more` up to this duration, and its transform then."""
-        transform = self._transform(duration)
+        transform, levers = self._transform(duration), self._robot.levers
         if self._avoidance.integration.by_hand:  # a few coarse steps are no one-parameter group
             levels = self._evaluate(transform, bundle.index, bundle.fraction)
         else:
-            levels = (self._transform(more).inverse(bundle.positions / LEVERS) * LEVERS)[:, None]
+            levels = (self._transform(more).inverse(bundle.positions / levers) * levers)[:, None]
         return self._refined(replace(bundle, levels=levels), transform), transform
 
     def through(self, transform: Diffeomorphism, duration: float) -> ArmSolution:
         """The motions of a given transform, of which that is the full duration."""
         bundle = self._sampled(transform)
-        return self._along(bundle, transform, duration, *self._clearances(bundle.positions / LEVERS))
+        return self._along(bundle, transform, duration, *self._clearances(bundle.positions / self._robot.levers))
 
     def _along(
         self, bundle: Bundle, transform: Diffeomorphism, duration: float, asked: Array, kept: Array
     ) -> ArmSolution:
-        p = bundle.positions / LEVERS
+        p = bundle.positions / self._robot.levers
         shaping, near = self._shaping(bundle), asked - kept > ROUNDING
         q = self._lifted.at(bundle.index, bundle.fraction)
         away = np.linalg.norm(self._robot.end_effector(p) - self._robot.end_effector(q), axis=1) > MOVED
@@ -199,7 +200,7 @@ class Solver:
     def _transform(self, duration: float) -> Diffeomorphism:
         limits = self._limits
         if self._generator is None or duration == 0:
-            return Identity(NUM_JOINTS)
+            return Identity(self._robot.num_joints)
         if self._avoidance.integration.by_hand:
             flow = self._avoidance.integration.of(Flow(self._generator, duration))
         elif self._coarse:
@@ -209,33 +210,35 @@ class Solver:
         return Conjugated(flow, limits)
 
     def _evaluate(self, transform: Diffeomorphism, index: Indices, fraction: Array) -> Array:
-        """Levels (N, 1, 6) of the samples: postures by their `LEVERS`, so that distances are metres."""
+        """Levels (N, 1, n) of the samples: postures by their `levers`, so that distances are metres."""
         q = self._limits.inside(self._lifted.at(index, fraction))
-        return (transform.inverse(q) * LEVERS)[:, None]
+        return (transform.inverse(q) * self._robot.levers)[:, None]
 
     def _refined(self, bundle: Bundle, transform: Diffeomorphism) -> Bundle:
         def integrated(index: Indices, fraction: Array) -> Array:
             return self._evaluate(transform, index, fraction)
 
-        return refined(bundle, integrated, max(self._spacing, COARSE_SPACING) if self._coarse else self._spacing)
+        spacing = max(self._spacing, self._settings.coarse_spacing) if self._coarse else self._spacing
+        return refined(bundle, integrated, spacing)
 
     def _lack(self, p: Array, most: float) -> Array:
-        """Metres (N,), up to `most`, by which the arm at configurations (N, 6) misses the clearance asked for."""
+        """Metres (N,), up to `most`, by which the arm at configurations (N, n) misses the clearance asked for."""
         asked, kept = self._clearances(p, most)
         return asked - kept
 
     def _clearances(self, p: Array, most: float = np.inf) -> tuple[Array, Array]:
-        """Clearances (N,), metres, that are asked for at configurations (N, 6), and that are kept.
+        """Clearances (N,), metres, that are asked for at configurations (N, n), and that are kept.
 
         Asked for is the margin, or what the starts and goal beside a configuration have. What is kept is cut off where
         it is more by what a contact moves between two checks, or less by `most`.
         """
-        asked = room_asked(np.array(p, order="C"), self._lifted.pins, self._room, LEVERS, SLOPE, self._margin)
-        highest = asked + SPEED * SNAPSHOT
+        pins, levers = self._lifted.pins, np.array(self._robot.levers)
+        asked = room_asked(np.array(p, order="C"), pins, self._room, levers, SLOPE, self._margin)
+        highest = asked + self._settings.speed * SNAPSHOT
         return asked, self._body.clearance(self._robot, p, self._avoidance.avoided, highest, asked - most)
 
     def _clearing_duration(self, p: Array) -> float:
-        """The shortest duration after which the flow has carried configurations (N, 6) clear, or the longest."""
+        """The shortest duration after which the flow has carried configurations (N, n) clear, or the longest."""
         assert self._generator is not None
         return clearing(self._generator, self._limits, p, self._lack, SNAPSHOT, self._between[1])
 
@@ -246,7 +249,7 @@ def clearing(field: VectorField, limits: JointLimits, p: Array, lack: Lack, step
     Args:
         field: generator of the flow, in the coordinates of the limits.
         limits: of the joints.
-        p: (N, 6) rad.
+        p: (N, n) rad.
         lack: metres by which postures miss the clearance that is asked for.
         step: flow time between two checks of the clearance.
         longest: flow time.

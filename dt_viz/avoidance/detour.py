@@ -18,6 +18,7 @@ from dt_viz.kernels.detours import detours, distinct
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.surfaces import golden_spiral
 from dt_viz.obstacles.union import Union
+from dt_viz.robot.sizing import scales
 
 NEARBY = 0.1
 """Distance that an obstacle may move from one motion to the next for its detour to be kept, metres."""
@@ -41,8 +42,9 @@ class DetourSettings:
     """Cost of the previous escape, relative to the least one, up to which it is kept."""
     turning: float = 5.0
     """Angle, rad, by which a detour turns while its obstacle moves by its radius."""
-    on_the_way: float = 0.10
-    """Length of an escape, metres, beyond which nothing else obstructs it: the arm also turns as it moves."""
+    on_the_way: float = scales(0.10)
+    """Length of an escape, metres, beyond which nothing else obstructs it: the arm also turns as it moves. That of an
+    arm scales with its reach, and is given for that of the JACO."""
     seconds_ahead: float = 1.5
     """Time for which the predicted poses of a moving obstacle count as occupied, s."""
     metres_ahead: float = 0.16

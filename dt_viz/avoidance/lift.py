@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.kernels.splines import cubics
 from dt_viz.robot.inverse_kinematics import TrackedPath, track
-from dt_viz.robot.robot import NUM_JOINTS, Robot
+from dt_viz.robot.robot import Robot
 
 NUM_CONFIGURATIONS = 100
 """Samples of each rollout before refinement."""
@@ -26,25 +26,25 @@ class Lift:
     fractions: Array
     """(R, T) increasing along each rollout."""
     tracked: TrackedPath
-    """Joints at these fractions; its q has shape (R, T, 6)."""
+    """Joints at these fractions; its q has shape (R, T, n)."""
     reference: Array
-    """(6,) posture that the arm stays near to, rad."""
+    """(n,) posture that the arm stays near to, rad."""
     moving: Mask
     """(R,) rollouts that the arm moves along."""
     shaping: Mask
     """(R,) those of them that an avoidance is made for."""
     exactly: Callable[[Array, Indices, Array], Array] | None = None
-    """Takes postures (N, 6) between the fractions onto the motion that they follow, of these rollouts (N,) at these
+    """Takes postures (N, n) between the fractions onto the motion that they follow, of these rollouts (N,) at these
     fractions (N,); None is content with the spline."""
 
     @cached_property
     def _splines(self) -> tuple[Array, Array]:
-        """Fractions (R, T − 1) at which the cubics begin, and their coefficients (4, R·(T − 1), 6)."""
+        """Fractions (R, T − 1) at which the cubics begin, and their coefficients (4, R·(T − 1), n)."""
         coefficients = cubics(np.array(self.fractions, order="C"), np.array(self.tracked.q, order="C"))
-        return self.fractions[:, :-1], coefficients.reshape(4, -1, NUM_JOINTS)
+        return self.fractions[:, :-1], coefficients.reshape(4, -1, self.tracked.q.shape[-1])
 
     def at(self, index: Indices, fraction: Array) -> Array:
-        """Configurations (N, 6), rad, of the rollouts `index` (N,) at the fractions `fraction` (N,)."""
+        """Configurations (N, n), rad, of the rollouts `index` (N,) at the fractions `fraction` (N,)."""
         begins, (a, b, c, d) = self._splines
         apart = 2 * np.arange(len(begins))[:, None]  # so that one search finds the piece of the right rollout
         piece = np.searchsorted((begins + apart).ravel(), fraction + 2 * index, side="right") - 1
@@ -53,12 +53,12 @@ class Lift:
         return q if self.exactly is None else self.exactly(q, index, fraction)
 
     def along(self, rollout: int) -> TrackedPath:
-        """The joints along one of the rollouts: its q has shape (T, 6)."""
+        """The joints along one of the rollouts: its q has shape (T, n)."""
         return TrackedPath(*(values[rollout] for values in _fields(self.tracked)))
 
     @cached_property
     def pins(self) -> Array:
-        """(R' + 1, 6) postures at the starts of the R' rollouts that shape the flow, and at the goal, rad."""
+        """(R' + 1, n) postures at the starts of the R' rollouts that shape the flow, and at the goal, rad."""
         q = self.tracked.q[self.shaping]
         return np.concatenate([q[:, 0], q[:1, -1]])
 
@@ -81,8 +81,8 @@ def lift(robot: Robot, fractions: Array, paths: Array, reference: Array, initial
         robot: whose joints.
         fractions: (R, T) where on their base rays the samples are.
         paths: (R, T, 3) end effector there, metres.
-        reference: (6,) posture that the arm stays near to, rad.
-        initial: (R, T, 6) joints of nearby paths to begin from, rad.
+        reference: (n,) posture that the arm stays near to, rad.
+        initial: (R, T, n) joints of nearby paths to begin from, rad.
     """
-    start, every = np.broadcast_to(reference, (len(paths), NUM_JOINTS)), np.ones(len(paths), bool)
+    start, every = np.broadcast_to(reference, (len(paths), robot.num_joints)), np.ones(len(paths), bool)
     return Lift(fractions, track(robot, paths, start, initial, reference=start), reference, every, every)

@@ -9,8 +9,8 @@ from dt_viz.avoidance.detour import Detour, carried_over
 from dt_viz.avoidance.start_status import StartStatus
 from dt_viz.obstacles.shapes import Obstacle
 
-Posture = tuple[float, float, float, float, float, float]
-"""Posture that the arm stays near to along all rollouts: six joint angles, rad."""
+Posture = tuple[float, ...]
+"""Posture that the arm stays near to along all rollouts: joint angles, rad."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,14 +11,14 @@ from functools import cached_property
 
 import numpy as np
 
-from dt_viz.avoidance.arm_field import LEVERS
+from dt_viz.avoidance.arm_settings import WholeArmSettings
 from dt_viz.flows.fields import Array, Mask
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.body_points import BodyPoints
 from dt_viz.robot.collision import SELF_MARGIN
 from dt_viz.robot.inverse_kinematics import loses_branch, track
-from dt_viz.robot.robot import NUM_JOINTS, Robot
+from dt_viz.robot.robot import Robot
 
 NUM_TRIED = 384
 """Number of random postures that they are chosen from."""
@@ -26,13 +26,6 @@ SPREAD = (0.2, 2.0)
 """Smallest and largest standard deviation of their joints from the usual posture, rad."""
 REACHED = 1e-4
 """Largest distance of the hand from a place that counts as reached, metres."""
-IN_THE_WAY = 10.0
-"""Cost of each metre that the mean motion lacks of the clearance that is asked for, against a metre from the usual
-postures."""
-ALIKE = 0.15
-"""Root mean square distance of postures, by `LEVERS`, up to which reference postures are alike, metres."""
-AT_ENDS, ENDS = 40.0, 0.06
-"""Factor by which that costs more at the ends of the motion, and distance from them over which this fades, metres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,33 +36,34 @@ class ReferencePostures:
     body: BodyPoints
     """Body points of the links that can move away."""
     references: Array
-    """(K, 6) the postures, rad."""
+    """(K, n) the postures, rad."""
     at_starts: Array
-    """(K, R, 6) postures that the arm rests in at the starts with them, rad."""
+    """(K, R, n) postures that the arm rests in at the starts with them, rad."""
     on_path: Array
-    """(K, T, 6) postures along the mean motion, rad."""
+    """(K, T, n) postures along the mean motion, rad."""
     away: Array
-    """(K,) root mean square distance of the postures from the usual ones, metres, by `LEVERS`."""
+    """(K,) root mean square distance of the postures from the usual ones, metres, by `Robot.levers`."""
 
     @cached_property
     def _stuck(self) -> Array:
         """(K, T) weight of what is in the way on the path: near its ends, where no flow moves the arm, it is large."""
-        ends = (self.on_path[:, [0, -1], None] - self.on_path[:, None]) * LEVERS
-        near = np.exp(-(ends**2).sum(axis=3) / (2 * ENDS**2)).max(axis=1)
-        return IN_THE_WAY * (1 + AT_ENDS * near)
+        settings = WholeArmSettings.of(self.robot)
+        ends = (self.on_path[:, [0, -1], None] - self.on_path[:, None]) * self.robot.levers
+        near = np.exp(-(ends**2).sum(axis=3) / (2 * settings.ends**2)).max(axis=1)
+        return settings.in_the_way * (1 + settings.at_ends * near)
 
     def room(self, obstacle: Union | Obstacle, enough: float) -> Array:
         """Distances (K, R + 1), metres, of the arm from an obstacle at starts and goal, up to what is enough."""
         return self._clearance(np.concatenate([self.at_starts, self.on_path[:, -1:]], axis=1), obstacle, enough)
 
     def _clearance(self, q: Array, obstacle: Union | Obstacle, enough: float) -> Array:
-        """Distances (K, N), metres, at postures (K, N, 6), up to what is enough."""
-        return self.body.clearance(self.robot, q.reshape(-1, NUM_JOINTS), obstacle, enough).reshape(q.shape[:2])
+        """Distances (K, N), metres, at postures (K, N, n), up to what is enough."""
+        return self.body.clearance(self.robot, q.reshape(-1, q.shape[-1]), obstacle, enough).reshape(q.shape[:2])
 
     def alike(self, posture: int) -> Mask:
         """(K,) which postures are like one of them."""
-        apart = (self.on_path - self.on_path[posture]) * LEVERS
-        return np.sqrt((apart**2).sum(axis=2).mean(axis=1)) < ALIKE
+        apart = (self.on_path - self.on_path[posture]) * self.robot.levers
+        return np.sqrt((apart**2).sum(axis=2).mean(axis=1)) < WholeArmSettings.of(self.robot).alike
 
     def cost(self, obstacle: Union | Obstacle, asked: float) -> Array:
         """Costs (K,), metres, of the detour from the usual postures and of what lies in the way on the path.
@@ -82,7 +76,7 @@ class ReferencePostures:
         return self.away + (self._stuck * lacking).mean(axis=1)
 
 
-def reference_postures(robot: Robot, body: BodyPoints, usual: Array, starts: Array, path: Array) -> ReferencePostures:
+def reference_postures(robot: Robot, usual: Array, starts: Array, path: Array) -> ReferencePostures:
     """Find reference postures for the motions of a task.
 
     Random postures are brought to the mean start, then each follows all starts and the mean motion. Those stay that do
@@ -91,8 +85,7 @@ def reference_postures(robot: Robot, body: BodyPoints, usual: Array, starts: Arr
 
     Args:
         robot: the arm.
-        body: all body points.
-        usual: (6,) the posture that the arm usually stays near to, rad.
+        usual: (n,) the posture that the arm usually stays near to, rad.
         starts: (R, 3) places where motions start, metres.
         path: (T, 3) the mean motion, metres; its end is the goal.
 
@@ -101,20 +94,20 @@ def reference_postures(robot: Robot, body: BodyPoints, usual: Array, starts: Arr
     """
     rng = np.random.default_rng(0)  # the same for each visitor
     scale = rng.uniform(*SPREAD, size=(NUM_TRIED, 1))
-    tried = robot.clip(usual + scale * rng.normal(size=(NUM_TRIED, NUM_JOINTS)))
+    tried = robot.clip(usual + scale * rng.normal(size=(NUM_TRIED, robot.num_joints)))
     at_start = track(robot, np.broadcast_to(starts.mean(axis=0), (NUM_TRIED, 1, 3)), tried)
     reaches = (at_start.error < REACHED) & ~at_start.limits_hit & ~at_start.damped
     references = np.concatenate([usual[None], at_start.q[reaches[:, 0], 0]])
     places = np.concatenate([starts, path])
     paths = np.broadcast_to(places, (len(references), *places.shape))
     tracked = track(robot, paths, references, reference=references)
-    moving = body.on_moving_links.with_end_effector(robot)
+    moving = robot.links.with_end_effector(robot)
     heights = (moving.positions(robot, tracked.q)[..., 2] - moving.radius).min(axis=(1, 2))
     follows = (tracked.error < REACHED) & ~tracked.limits_hit & ~tracked.damped
     sound = follows.all(axis=1) & ~loses_branch(robot, tracked.q, paths) & (heights >= min(0.0, heights[0]))
-    sound[sound] = [body.self_clearance(robot, q, SELF_MARGIN) >= SELF_MARGIN for q in tracked.q[sound]]
+    sound[sound] = [robot.self_clearance(q, SELF_MARGIN) >= SELF_MARGIN for q in tracked.q[sound]]
     sound[0] = True
-    away = np.sqrt((((tracked.q - tracked.q[0]) * LEVERS) ** 2).sum(axis=2).mean(axis=1))
+    away = np.sqrt((((tracked.q - tracked.q[0]) * robot.levers) ** 2).sum(axis=2).mean(axis=1))
     order = np.argsort(np.where(sound, away, np.inf), kind="stable")[: sound.sum()]
     at_starts, on_path = np.split(tracked.q[order], [len(starts)], axis=1)
     return ReferencePostures(robot, moving, references[order], at_starts, on_path, away[order])

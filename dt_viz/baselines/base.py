@@ -33,7 +33,7 @@ class Problem:
     """The task, and our imitation of it."""
     robot: Robot
     postures: tuple[Array, ...]
-    """Of the arm along each demonstration, (T_i, 6), rad; the first row is where a motion from that start begins."""
+    """Of the arm along each demonstration, (T_i, n), rad; the first row is where a motion from that start begins."""
 
     @property
     def task(self) -> Task:
@@ -50,7 +50,7 @@ class Plan:
     times: tuple[Array, ...]
     """(N_i,) seconds from the start."""
     joints: tuple[Array, ...] | None = None
-    """(N_i, 6) of the arm, rad, where the method plans them; otherwise the arm tracks the paths."""
+    """(N_i, n) of the arm, rad, where the method plans them; otherwise the arm tracks the paths."""
     warnings: tuple[str, ...] = ()
     """What the motions fail at, for the user."""
 

@@ -21,14 +21,15 @@ from pathlib import Path
 
 import numpy as np
 
-from dt_viz.baselines.base import Method, Plan, Planner, Problem
+from dt_viz.baselines.base import Method, NotFittedError, Plan, Planner, Problem
 from dt_viz.baselines.postures import PlanningScene, Query, planned
 from dt_viz.baselines.weights import FOLDER, check_shapes, load_weights
 from dt_viz.errors import Cancelled, end_if, never
 from dt_viz.flows.fields import Array
 from dt_viz.obstacles.union import Union
-from dt_viz.robot.robot import NUM_JOINTS
 
+TRAINED_FOR = "jaco"
+"""Name of the arm whose postures the weights are for."""
 VERSION = 2
 """Version of the weights, raised with every change to what they mean."""
 
@@ -50,10 +51,9 @@ class MPNetSettings:
     seed: int = 0
     """Seed of the dropout of each motion."""
 
-    @property
-    def widths(self) -> tuple[int, ...]:
+    def widths(self, num_joints: int) -> tuple[int, ...]:
         """Widths of all layers, from (q, q_goal) to the next posture."""
-        return 2 * NUM_JOINTS, *self.hidden, NUM_JOINTS
+        return 2 * num_joints, *self.hidden, num_joints
 
 
 ARCHITECTURE = MPNetSettings()
@@ -100,25 +100,25 @@ class MPNetModel:
 
     planning: Network
     centre: Array
-    """(6,) rad, the postures' place in the network's unit."""
+    """(n,) rad, the postures' place in the network's unit."""
     scale: Array
-    """(6,) rad for one such unit."""
+    """(n,) rad for one such unit."""
 
     @classmethod
-    def of(cls, arrays: Mapping[str, Array]) -> MPNetModel:
+    def of(cls, arrays: Mapping[str, Array], num_joints: int) -> MPNetModel:
         """Make the network that weights describe, as `dt_viz.baselines.mpnet_training.train` returns them.
 
         Raises:
             NotFittedError: an array is missing, or of another shape.
         """
-        shapes: dict[str, tuple[int, ...]] = {"centre": (NUM_JOINTS,), "scale": (NUM_JOINTS,)}
-        for k, (num_in, num_out) in enumerate(pairwise(ARCHITECTURE.widths)):
+        shapes: dict[str, tuple[int, ...]] = {"centre": (num_joints,), "scale": (num_joints,)}
+        for k, (num_in, num_out) in enumerate(pairwise(ARCHITECTURE.widths(num_joints))):
             shapes |= {f"W_{k}": (num_out, num_in), f"c_{k}": (num_out,)}
         check_shapes("mpnet", arrays, shapes | {"slopes": (len(ARCHITECTURE.hidden),)})
         return cls(Network.of(arrays), arrays["centre"], arrays["scale"])
 
     def next(self, q: Array, goal: Array, rng: np.random.Generator) -> Array:
-        """The next posture (6,), rad, on the way from q (6,) to a goal (6,).
+        """The next posture (n,), rad, on the way from q (n,) to a goal (n,).
 
         Args:
             q: posture, rad.
@@ -131,7 +131,7 @@ class MPNetModel:
 
 
 Replan = Callable[[Array, Array], list[Array]]
-"""Plans a stretch between two postures (6,) again: its postures, both ends among them."""
+"""Plans a stretch between two postures (n,) again: its postures, both ends among them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,5 +243,7 @@ class MPNet(Method):
         return MPNetPlanner(problem, self.model(problem))
 
     def model(self, problem: Problem) -> MPNetModel:
-        """Load the task's network. Raises NotFittedError as `Method.fit`."""
-        return MPNetModel.of(load_weights(MPNet.name, VERSION, problem.task, self.folder))
+        """Load the task's network. Raises NotFittedError as `Method.fit`, and for another arm."""
+        if problem.robot.name != TRAINED_FOR:
+            raise NotFittedError(f"trained for the {TRAINED_FOR.upper()} only")
+        return MPNetModel.of(load_weights(MPNet.name, VERSION, problem.task, self.folder), problem.robot.num_joints)

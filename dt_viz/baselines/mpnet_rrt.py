@@ -17,7 +17,7 @@ from dt_viz.baselines.base import Planner, Problem
 from dt_viz.baselines.mpnet import ARCHITECTURE, MPNet, MPNetPlanner, Search
 from dt_viz.baselines.postures import Query
 from dt_viz.flows.fields import Array
-from dt_viz.robot.robot import NUM_JOINTS, Robot
+from dt_viz.robot.robot import Robot
 
 _one_at_a_time = threading.Lock()
 """OMPL's random numbers have one seed for the whole process."""
@@ -74,37 +74,40 @@ def _rrt_connect(watch: _Watch, robot: Robot, start: Array, goal: Array) -> list
         """Checks straight lines at every point of them, not at samples."""
 
         def checkMotion(self, start: object, end: object) -> bool:
-            return watch.is_free(_posture(start), _posture(end))
+            return watch.is_free(posture(start), posture(end))
+
+    def posture(state: Any) -> Array:  # noqa: ANN401 - OMPL's
+        return np.array([state[joint] for joint in range(robot.num_joints)])
 
     util.setLogLevel(util.LOG_NONE)
     util.RNG.setSeed(ARCHITECTURE.seed + 1)  # 0 would be random
-    space = base.RealVectorStateSpace(NUM_JOINTS)
-    space.setBounds(_bounds(base.RealVectorBounds(NUM_JOINTS), robot, start, goal))
+    space = base.RealVectorStateSpace(robot.num_joints)
+    space.setBounds(_bounds(base.RealVectorBounds(robot.num_joints), robot, start, goal))
     setup = geometric.SimpleSetup(space)
     information = setup.getSpaceInformation()
     motions = Motions(information)  # OMPL does not keep it
-    setup.setStateValidityChecker(lambda state: watch.is_free(_posture(state), _posture(state)))
+    setup.setStateValidityChecker(lambda state: watch.is_free(posture(state), posture(state)))
     information.setMotionValidator(motions)
     setup.setPlanner(geometric.RRTConnect(information))
     ends = space.allocState(), space.allocState()
     for state, q in zip(ends, (start, goal), strict=True):
-        for joint in range(NUM_JOINTS):
-            state[joint] = float(q[joint])  # copyFromReals of ompl 2.0.1 crashes
+        for joint, angle in enumerate(q):
+            state[joint] = float(angle)  # copyFromReals of ompl 2.0.1 crashes
     setup.setStartAndGoalStates(*ends)
     setup.solve(base.PlannerTerminationCondition(watch.is_over))
     if not setup.haveExactSolutionPath():
         return []
     path = setup.getSolutionPath()  # owns its states
-    return [start, *(_posture(state) for state in path.getStates()[1:-1]), goal]
+    return [start, *(posture(state) for state in path.getStates()[1:-1]), goal]
 
 
 def _bounds(bounds: Any, robot: Robot, start: Array, goal: Array) -> Any:  # noqa: ANN401 - OMPL's
     """The joint limits, or half a turn beyond the ends where there are none, in OMPL's bounds."""
     lowest = np.where(np.isinf(robot.lower), np.minimum(start, goal) - np.pi, robot.lower)
     highest = np.where(np.isinf(robot.upper), np.maximum(start, goal) + np.pi, robot.upper)
-    for joint in range(NUM_JOINTS):
-        bounds.setLow(joint, float(lowest[joint]))
-        bounds.setHigh(joint, float(highest[joint]))
+    for joint, (low, high) in enumerate(zip(lowest, highest, strict=True)):
+        bounds.setLow(joint, float(low))
+        bounds.setHigh(joint, float(high))
     return bounds
 
 
@@ -128,7 +131,3 @@ class _Watch:
         except BaseException as error:
             self.raised = error
             return False
-
-
-def _posture(state: Any) -> Array:  # noqa: ANN401 - OMPL's
-    return np.array([state[joint] for joint in range(NUM_JOINTS)])

@@ -48,7 +48,7 @@ def train(problem: Problem, num_epochs: int, report: Callable[[str], None], seed
     """
     x, y, centre, scale = steps(problem)
     rng = np.random.default_rng(seed)
-    arrays = initial(ARCHITECTURE.widths, rng)
+    arrays = initial(ARCHITECTURE.widths(problem.robot.num_joints), rng)
     mean, spread = ({name: np.zeros_like(array) for name, array in arrays.items()} for _ in range(2))
     num_steps = 0
     for epoch in range(num_epochs):
@@ -71,7 +71,7 @@ def steps(problem: Problem) -> tuple[Array, Array, Array, Array]:
     """Steps to learn from.
 
     Returns:
-        Postures and goals (N, 12), next postures (N, 6), both in the network's unit; centre and scale (6,) of the
+        Postures and goals (N, 2n), next postures (N, n), both in the network's unit; centre and scale (n,) of the
         unit, rad.
 
     Raises:

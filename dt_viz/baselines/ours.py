@@ -67,11 +67,11 @@ class _WholeArmPlanner:
         )
 
     def _resting(self, nominal: Nominal, place: int) -> tuple[Array, Array]:
-        """The posture (1, 6), rad, at the start of a rollout, at time 0 (1,)."""
+        """The posture (1, n), rad, at the start of a rollout, at time 0 (1,)."""
         return self.follower.undisturbed(nominal).tracked.q[place, :1], np.zeros(1)
 
     def _moving(self, nominal: Nominal, obstacle: Union) -> dict[int, tuple[Array, Array]]:
-        """Joints (N, 6), rad, and times (N,), s, of the rollouts that the arm finds a way for, by their place."""
+        """Joints (N, n), rad, and times (N,), s, of the rollouts that the arm finds a way for, by their place."""
         avoidance = ArmAvoidance(obstacle.parts)
         admission = self.follower.admission(nominal, avoidance)
         if admission.blocked:

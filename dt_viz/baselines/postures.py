@@ -11,8 +11,8 @@ from dt_viz.baselines.base import Plan, Problem
 from dt_viz.flows.fields import Array
 from dt_viz.metrics import arc_length, interpolate
 from dt_viz.obstacles.union import Union
-from dt_viz.robot.body_points import BodyPoints, load_body_points
-from dt_viz.robot.collision import CollisionModel, load_collision_model
+from dt_viz.robot.body_points import BodyPoints
+from dt_viz.robot.collision import CollisionModel
 from dt_viz.robot.inverse_kinematics import inverse_kinematics
 from dt_viz.robot.retiming import within_velocity_limits
 from dt_viz.robot.robot import Robot
@@ -26,9 +26,9 @@ class Query:
     """One motion that is asked for."""
 
     start: Array
-    """(6,) posture, rad."""
+    """(n,) posture, rad."""
     goal: Array
-    """(6,) posture at the end of the demonstration with the nearest start, rad."""
+    """(n,) posture at the end of the demonstration with the nearest start, rad."""
     duration: float
     """Duration of that demonstration, seconds."""
 
@@ -59,10 +59,10 @@ class PlanningScene:
     @classmethod
     def of(cls, robot: Robot, obstacle: Union) -> PlanningScene:
         """The surroundings of an arm with an obstacle."""
-        return cls(robot, obstacle, load_body_points().on_moving_links, load_collision_model())
+        return cls(robot, obstacle, robot.links, robot.collision)
 
     def is_free(self, start: Array, end: Array) -> bool:
-        """Decide whether the arm is free on the straight line between two postures (6,), rad, at every point of it."""
+        """Decide whether the arm is free on the straight line between two postures (n,), rad, at every point of it."""
         turn = np.abs(end - start)
         num = 1 + int(np.ceil((self.model.reach * turn).sum(axis=1).max() / SPACING))
         line = start + np.linspace(0, 1, num + 1)[:, None] * (end - start)
@@ -76,7 +76,7 @@ class PlanningScene:
         return itself is None or itself.distance > 0
 
     def _clears(self, line: Array) -> bool:
-        """Decide whether the arm clears the obstacle, from samples (N, 6), rad."""
+        """Decide whether the arm clears the obstacle, from samples (N, n), rad."""
         if (self.obstacle.signed_distance(self.robot.end_effector(line)) < 0).any():
             return False
         room = self.body.clearance(self.robot, line, self.obstacle)
@@ -94,7 +94,7 @@ def planned(problem: Problem, queries: Sequence[Query], ways: Sequence[Array], w
     Args:
         problem: what the method was fitted to.
         queries: what was asked for.
-        ways: corners (K_i, 6), rad, for each of them.
+        ways: corners (K_i, n), rad, for each of them.
         warnings: what the motions fail at.
     """
     paths, times, joints = [], [], []

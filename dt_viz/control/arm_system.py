@@ -12,7 +12,7 @@ from dt_viz.flows.fields import Array
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.kernels.proximity import COMPLEX_STEP
 from dt_viz.robot.inverse_kinematics import soft_limits, track
-from dt_viz.robot.robot import NUM_JOINTS, Robot
+from dt_viz.robot.robot import Robot
 
 NUM_POLISHING = 4
 """Number of Newton steps from the result of `track` to the exact best posture; they converge quadratically."""
@@ -34,44 +34,46 @@ class Section:
 
     robot: Robot
     reference: Array
-    """(6,) reference posture of h, rad."""
+    """(n,) reference posture of h, rad."""
 
     def postures(self, x: Array) -> Array:
-        """Compute Q(x), (*B, T, 6) rad, for paths `x` (*B, T, 3), metres."""
-        start = np.broadcast_to(self.reference, (*x.shape[:-2], NUM_JOINTS))
-        q = track(self.robot, x, start, reference=start).q.reshape(-1, NUM_JOINTS)
+        """Compute Q(x), (*B, T, n) rad, for paths `x` (*B, T, 3), metres."""
+        n = self.robot.num_joints
+        start = np.broadcast_to(self.reference, (*x.shape[:-2], n))
+        q = track(self.robot, x, start, reference=start).q.reshape(-1, n)
         targets = x.reshape(-1, 3)
         for _ in range(NUM_POLISHING):
             slope, K = self._derivatives(q)
             miss = np.concatenate([-slope, targets - self.robot.end_effector(q)], axis=1)
-            q = q + np.linalg.solve(K, miss[..., None])[:, :NUM_JOINTS, 0]
-        return q.reshape(*x.shape[:-1], NUM_JOINTS)
+            q = q + np.linalg.solve(K, miss[..., None])[:, :n, 0]
+        return q.reshape(*x.shape[:-1], n)
 
     def velocities(self, q: Array, velocity: Array) -> Array:
-        """Compute DQ·ẋ, (*B, 6) rad/s, at postures q = Q(x) (*B, 6) for the end effector's `velocity` ẋ (*B, 3), m/s.
+        """Compute DQ·ẋ, (*B, n) rad/s, at postures q = Q(x) (*B, n) for the end effector's `velocity` ẋ (*B, 3), m/s.
 
         At other postures it is the smooth continuation with the best-fitting multipliers, which still follows ẋ.
         """
-        flat = velocity.reshape(-1, 3)
-        wanted = np.concatenate([np.zeros((len(flat), NUM_JOINTS)), flat], axis=1)
-        K = self._derivatives(q.reshape(-1, NUM_JOINTS))[1]
-        return np.linalg.solve(K, wanted[..., None])[:, :NUM_JOINTS, 0].reshape(q.shape)
+        flat, n = velocity.reshape(-1, 3), q.shape[-1]
+        wanted = np.concatenate([np.zeros((len(flat), n)), flat], axis=1)
+        K = self._derivatives(q.reshape(-1, n))[1]
+        return np.linalg.solve(K, wanted[..., None])[:, :n, 0].reshape(q.shape)
 
     def _derivatives(self, q: Array) -> tuple[Array, Array]:
-        """Compute ∇h + Jᵀμ with the best μ, (N, 6), and the matrix above (N, 9, 9), at postures q (N, 6)."""
+        """Compute ∇h + Jᵀμ with the best μ, (N, n), and the matrix above (N, n + 3, n + 3), at postures q (N, n)."""
         slope, J = self._slopes(q)
         multipliers = -np.linalg.solve(J @ J.transpose(0, 2, 1), J @ slope[..., None])  # (N, 3, 1)
-        K = np.zeros((len(q), NUM_JOINTS + 3, NUM_JOINTS + 3))
-        K[:, :NUM_JOINTS, NUM_JOINTS:], K[:, NUM_JOINTS:, :NUM_JOINTS] = J.transpose(0, 2, 1), J
-        for joint, step in enumerate(1j * COMPLEX_STEP * np.eye(NUM_JOINTS)):
+        num, n = q.shape
+        K = np.zeros((num, n + 3, n + 3))
+        K[:, :n, n:], K[:, n:, :n] = J.transpose(0, 2, 1), J
+        for joint, step in enumerate(1j * COMPLEX_STEP * np.eye(n)):
             slope_, J_ = self._slopes(q + step)
             turned = slope_ + (J_.transpose(0, 2, 1) @ multipliers)[..., 0]
-            K[:, :NUM_JOINTS, joint] = turned.imag / COMPLEX_STEP
+            K[:, :n, joint] = turned.imag / COMPLEX_STEP
         return slope + (J.transpose(0, 2, 1) @ multipliers)[..., 0], K
 
     def _slopes(self, q: Any) -> tuple[Array, Array]:  # noqa: ANN401, real or complex
-        """Compute ∇h (N, 6) and J (N, 3, 6) at postures q (N, 6), real or complex."""
-        chain, reference, settings = self.robot.chain(q.T), self.reference, self.robot.tracking
+        """Compute ∇h (N, n) and J (N, 3, n) at postures q (N, n), real or complex."""
+        chain, reference, settings = self.robot.chain(q.T), self.reference, self.robot.sized_tracking
         excess = q - np.clip(q.real, *soft_limits(self.robot, reference))
         excess = np.where(excess.real == 0, 0, excess)
         turn = chain.direction - self.robot.hand_direction(reference)[:, None]
@@ -97,11 +99,11 @@ class ArmSystem:
     """ψ_q, from the postures of the avoiding motion to those of the undisturbed one."""
 
     def postures(self, x: Array) -> Array:
-        """Compute the states (*B, T, 6), rad, whose undisturbed postures have the end effector at `x` (*B, T, 3), m."""
+        """Compute the states (*B, T, n), rad, whose undisturbed postures have the end effector at `x` (*B, T, 3), m."""
         return self.transform.inverse(self.section.postures(x))
 
     def velocity(self, p: Array) -> Array:
-        """Compute ṗ, (*B, 6), rad/s, at states `p` (*B, 6): the derivative of ψ_q⁻¹ along q̇, without an inversion."""
+        """Compute ṗ, (*B, n), rad/s, at states `p` (*B, n): the derivative of ψ_q⁻¹ along q̇, without an inversion."""
         q = self.transform.forward(p)
         velocity = self.section.velocities(q, self.hand.velocity(self.section.robot.end_effector(q)))
         return self.transform.inverse_tangents(q, velocity[..., None])[1][..., 0]
@@ -111,6 +113,6 @@ class ArmSystem:
         return self.hand.lyapunov(self.section.robot.end_effector(self.transform.forward(p)))
 
     def rollout(self, p0: Array, times: Array) -> Array:
-        """Compute p(t), (*B, T, 6), exactly, from states `p0` (*B, 6) at `times` (T,) or (*B, T), seconds."""
+        """Compute p(t), (*B, T, n), exactly, from states `p0` (*B, n) at `times` (T,) or (*B, T), seconds."""
         x0 = self.section.robot.end_effector(self.transform.forward(p0))
         return self.postures(self.hand.rollout(x0, times))

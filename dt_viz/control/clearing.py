@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dt_viz.avoidance.arm import BESIDE, WholeArm
-from dt_viz.avoidance.arm_field import LEVERS, REACH_PER_TEMPERATURE, SPEED, WholeArmField
+from dt_viz.avoidance.arm import WholeArm
+from dt_viz.avoidance.arm_field import WholeArmField
 from dt_viz.avoidance.arm_solver import MAX_DURATION, ROUNDING, SLOPE
 from dt_viz.avoidance.arm_solver import clearing as clearing_time
 from dt_viz.avoidance.avoidance import ArmAvoidance
@@ -21,7 +21,7 @@ from dt_viz.flows.diffeomorphisms import Conjugated, Diffeomorphism, Flow, Ident
 from dt_viz.flows.fields import Array
 from dt_viz.kernels.blocks import room_asked
 from dt_viz.obstacles.shapes import Obstacle
-from dt_viz.robot.robot import NUM_JOINTS
+from dt_viz.robot.sizing import sized
 
 NUM_COMPARED = 16
 """Number of colliding postures that escape directions are compared by, about; half of it where an obstacle moves, for
@@ -30,9 +30,6 @@ STEP = 0.05
 """Flow time between two looks at the clearance."""
 COARSE_STEP = 0.2
 """Length of a Runge–Kutta step, in flow time."""
-BEYOND = 0.03
-"""Reach of the field beyond the margin, metres, at least."""
-NO_PINS = np.empty((0, NUM_JOINTS))
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +51,7 @@ class Clearing:
     def transform(self, arm: WholeArm, duration: float) -> Diffeomorphism:
         """ψ_q for a flow time, from the postures where the robot moves to those of its undisturbed motion."""
         if self.field is None or duration <= 0:
-            return Identity(NUM_JOINTS)
+            return Identity(arm.robot.num_joints)
         return Conjugated(Flow(self.field, duration, max(2, math.ceil(duration / COARSE_STEP))), arm.limits)
 
 
@@ -71,12 +68,12 @@ def clearing(
 
     Args:
         arm: whose body points are to be clear.
-        q: (N, 6) postures of the undisturbed motion that are to be clear, in their order, rad.
+        q: (N, n) postures of the undisturbed motion that are to be clear, in their order, rad.
         avoidance: what is to be avoided, and by how much.
         velocities: (P, 3) of the obstacles, m/s.
         before: whose escape directions are gone on with; those of obstacles that are not in the way any more are kept.
         turn: largest angle by which a direction turns away from that before, rad.
-        end: (6,) free posture beside which the clearance may be what it has itself; None is none.
+        end: (n,) free posture beside which the clearance may be what it has itself; None is none.
     """
     if avoidance is None or not avoidance.avoided.parts:
         return Clearing()
@@ -85,7 +82,7 @@ def clearing(
     chain = arm.robot.chain(q.T)
     points, tangents = arm.body.of_chain(chain), np.gradient(chain.position.T, axis=0) if len(q) > 1 else 0 * q[:, :3]
     tangents = tangents / np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
-    beside = max(BESIDE, avoidance.margin)  # that of what is fast may be wider
+    beside = max(arm.settings.beside, avoidance.margin)  # that of what is fast may be wider
     directions = tuple(
         _direction(arm, points, arm.clearance(q, part, beside), tangents, part, velocity, avoidance, way, turn)
         for part, velocity, way in zip(parts, velocities, known, strict=True)
@@ -94,8 +91,9 @@ def clearing(
     if not met:
         return Clearing()
     obstacles, ways = zip(*met, strict=True)
-    reach = max(REACH_PER_TEMPERATURE * avoidance.temperature, avoidance.margin + BEYOND)
-    field = WholeArmField(arm.robot, arm.body, obstacles, np.stack(ways), NO_PINS, reach)
+    settings = arm.settings
+    reach = max(settings.reach_per_temperature * avoidance.temperature, avoidance.margin + settings.beyond)
+    field = WholeArmField(arm.robot, arm.body, obstacles, np.stack(ways), q[:0], reach)
 
     def lacking(p: Array, most: float) -> Array:
         return lack(arm, p, avoidance, end, most)
@@ -121,7 +119,7 @@ def _direction(
     near = np.flatnonzero(clearance < avoidance.margin)
     if not len(near):
         return before
-    bent = np.flatnonzero(clearance < max(BESIDE, avoidance.margin))
+    bent = np.flatnonzero(clearance < max(arm.settings.beside, avoidance.margin))
     num = NUM_COMPARED // 2 if velocity.any() else NUM_COMPARED
     compared = points[:, :, near[:: max(1, len(near) // num)]]
     escapes = escape_directions(
@@ -133,18 +131,18 @@ def _direction(
         num=1,
         velocity=velocity,
         previous=before,
-        settings=avoidance.detour,
+        settings=sized(avoidance.detour, arm.robot.size),
     )
     return escapes[0] if before is None else turned(before, escapes[0], turn, escapes)
 
 
 def lack(arm: WholeArm, p: Array, avoidance: ArmAvoidance, end: Array | None, most: float) -> Array:
-    """Distances (N,), metres, by which postures p (N, 6) miss the clearance that is asked for, up to `most`.
+    """Distances (N,), metres, by which postures p (N, n) miss the clearance that is asked for, up to `most`.
 
-    That is the margin, or beside a free posture `end` (6,) that has less itself, what it has.
+    That is the margin, or beside a free posture `end` (n,) that has less itself, what it has.
     """
-    pins = NO_PINS if end is None else end[None]
+    pins = p[:0] if end is None else end[None]
     room = arm.clearance(pins, avoidance.avoided) - ROUNDING
     pins, room = pins[room > 0], room[room > 0]
-    asked = room_asked(np.array(p, order="C"), pins, room, LEVERS, SLOPE, float(avoidance.margin))
-    return asked - arm.clearance(p, avoidance.avoided, asked + SPEED * STEP, asked - most)
+    asked = room_asked(np.array(p, order="C"), pins, room, np.array(arm.robot.levers), SLOPE, float(avoidance.margin))
+    return asked - arm.clearance(p, avoidance.avoided, asked + arm.settings.speed * STEP, asked - most)

@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dt_viz.avoidance.arm_field import LEVERS
 from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.control.arm_system import ArmSystem, Section
 from dt_viz.control.courses import Course, Progress, resting, shoved, straight_to, towards
@@ -30,7 +29,8 @@ from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
 from dt_viz.motion.following import Follower
 from dt_viz.motion.solve import Solved
 from dt_viz.robot.inverse_kinematics import track
-from dt_viz.robot.robot import NUM_JOINTS, Robot
+from dt_viz.robot.robot import Robot
+from dt_viz.robot.sizing import sized
 
 
 class Phase(Enum):
@@ -86,15 +86,15 @@ class ArmController:
         Raises:
             UnreachableError: the arm cannot get to where the motions start.
         """
-        self.settings = settings = settings or ControllerSettings()
+        self.settings = settings = sized(settings or ControllerSettings(), follower.robot.size)
         self._follower, self._solved, self._lock = follower, solved, threading.RLock()
         self._section = Section(follower.robot, follower.reference(solved.nominal))
         self._flow = ObstacleFlow(follower.whole_arm, solved.scenario.arm_avoidance, settings)
-        self._feasible = FeasibleVelocities(follower.whole_arm, follower.body, settings)
+        self._feasible = FeasibleVelocities(follower.whole_arm, settings)
         self._activity = Activity(rollout=rollout)
         self._progress: Progress | None = None
         self._q: Array | None = None
-        """(6,) where the robot was sent, rad."""
+        """(n,) where the robot was sent, rad."""
         self._tick: Tick | None = None
 
     @property
@@ -146,7 +146,7 @@ class ArmController:
     # --- What it is told to do ---
 
     def begin(self, q: ArrayLike, rollout: int | None = None) -> None:
-        """Begin at a posture (6,), rad, before the first tick: what lies ahead is known from then on.
+        """Begin at a posture (n,), rad, before the first tick: what lies ahead is known from then on.
 
         A rollout takes the place of the one that was begun with.
         """
@@ -177,7 +177,7 @@ class ArmController:
                 self._change(course, held=True)
 
     def displace(self, q: ArrayLike) -> None:
-        """Shove the robot towards a posture (6,), rad; it goes on from there."""
+        """Shove the robot towards a posture (n,), rad; it goes on from there."""
         with self._lock:
             if self._progress is not None:
                 end = self._follower.whole_arm.limits.inside(self._undisturbed_of(np.asarray(q, float)))
@@ -193,14 +193,14 @@ class ArmController:
     # --- What it does ---
 
     def step(self, q: ArrayLike, dt: float) -> Array:
-        """Compute the joint velocities (6,), rad/s, for the next `dt` seconds of a robot at `q` (6,), rad.
+        """Compute the joint velocities (n,), rad/s, for the next `dt` seconds of a robot at `q` (n,), rad.
 
         Raises:
-            ValueError: q is not six finite angles, or dt is not above 0.
+            ValueError: q is not one finite angle for each joint, or dt is not above 0.
         """
-        q = np.array(q, float)
-        if q.shape != (NUM_JOINTS,) or not np.isfinite(q).all():
-            raise ValueError(f"q: found {q}; accepted: {NUM_JOINTS} finite angles, rad")
+        q, num = np.array(q, float), self.robot.num_joints
+        if q.shape != (num,) or not np.isfinite(q).all():
+            raise ValueError(f"q: found {q}; accepted: {num} finite angles, rad")
         if not 0 < dt < np.inf:
             raise ValueError(f"dt: found {dt}; accepted: seconds, more than 0")
         with self._lock:
@@ -228,8 +228,8 @@ class ArmController:
             return tick.velocity.copy()
 
     def steps(self, q: ArrayLike, dt: float, num: int) -> Array:
-        """Compute the joint velocities (num, 6), rad/s, of some steps in a row of a robot that does as it is told."""
-        q, velocities = np.array(q, float), np.empty((num, NUM_JOINTS))
+        """Compute the joint velocities (num, n), rad/s, of some steps in a row of a robot that does as it is told."""
+        q, velocities = np.array(q, float), np.empty((num, self.robot.num_joints))
         for k in range(num):
             velocities[k] = self.step(q, dt)
             q = q + dt * velocities[k]
@@ -247,7 +247,7 @@ class ArmController:
             return Phase.HELD
         if tick is not None and progress.ended:
             target = self._flow.image(progress)
-            if np.linalg.norm((target - progress.course.q[-1]) * LEVERS) > self.settings.aside:
+            if np.linalg.norm((target - progress.course.q[-1]) * self.robot.levers) > self.settings.aside:
                 return Phase.ASIDE
             if self.rests and np.abs(q - target).max() < self.settings.at_rest:
                 return Phase.RESTING
@@ -278,10 +278,10 @@ class ArmController:
 
     @property
     def ahead(self) -> Array:
-        """(K, 6) the postures ahead, from where its motion is now on, rad."""
+        """(K, n) the postures ahead, from where its motion is now on, rad."""
         with self._lock:
             if self._progress is None:
-                return np.empty((0, NUM_JOINTS))
+                return np.empty((0, self.robot.num_joints))
             return self._flow.transform.inverse(self._follower.whole_arm.limits.inside(self._progress.ahead))
 
     @property
@@ -296,7 +296,7 @@ class ArmController:
 
     @property
     def undisturbed(self) -> Array:
-        """The posture (6,) at this moment of the motion without what is stacked on the learned one, rad."""
+        """The posture (n,) at this moment of the motion without what is stacked on the learned one, rad."""
         with self._lock:
             progress, solved = self._progress, self._solved
             if progress is None:
@@ -309,7 +309,7 @@ class ArmController:
     # --- Courses ---
 
     def _undisturbed_of(self, q: Array) -> Array:
-        """Find the undisturbed posture ψ_q(p) (6,) of a robot at a posture."""
+        """Find the undisturbed posture ψ_q(p) (n,) of a robot at a posture."""
         inside = self._follower.whole_arm.limits.inside
         return self._flow.transform.forward(inside(q))
 
@@ -343,7 +343,7 @@ class ArmController:
         self._progress, self._flow.changed = Progress(slowed, rate=rate), True
 
     def _onwards(self, q: Array, z: Array | None = None) -> Course:
-        """Make the undisturbed motion from a posture (6,) to where it is to go; see `towards`."""
+        """Make the undisturbed motion from a posture (n,) to where it is to go; see `towards`."""
         stack, starts, activity = self._solved.stack, self._solved.nominal.starts, self._activity
         hand, base, images = self.robot.end_effector(q), stack.rays.base, stack.rays.z0
         if activity.heading is Phase.HOMING:

@@ -15,8 +15,6 @@ from dt_viz.control.settings import ControllerSettings
 from dt_viz.flows.fields import Array
 from dt_viz.kernels.dodging import Forecast, LimitedArm, dodge
 from dt_viz.obstacles.shapes import records
-from dt_viz.robot.body_points import BodyPoints
-from dt_viz.robot.robot import NUM_JOINTS
 
 SOFT = 8
 """daqp's mark of a constraint that may be violated where there is no other way."""
@@ -27,13 +25,13 @@ class Tick:
     """What came of a tick."""
 
     q: Array
-    """(6,) where the robot was, rad."""
+    """(n,) where the robot was, rad."""
     wanted: Array
-    """(6,) velocity that was asked for, rad/s."""
+    """(n,) velocity that was asked for, rad/s."""
     velocity: Array
-    """(6,) that was found, rad/s."""
+    """(n,) that was found, rad/s."""
     evasive: Array | None
-    """(6,) velocity that evades obstacles which move, rad/s; None where the wanted one leads past them."""
+    """(n,) velocity that evades obstacles which move, rad/s; None where the wanted one leads past them."""
     contacts: list[tuple[Array, Array]]
     """Rows of the table's and the arm's own limits; see `ContactLimit.rows`."""
     clearance: float
@@ -43,8 +41,8 @@ class Tick:
 class FeasibleVelocities:
     """Finds the velocity nearest to a wanted one that all limits allow (`dt_viz.control.limits`)."""
 
-    def __init__(self, arm: WholeArm, body: BodyPoints, settings: ControllerSettings) -> None:
-        """Make the limits of an arm, whose base and links have these body points."""
+    def __init__(self, arm: WholeArm, settings: ControllerSettings) -> None:
+        """Make the limits of an arm."""
         robot = self._robot = arm.robot
         self._settings = settings
         self._limits = (
@@ -54,16 +52,15 @@ class FeasibleVelocities:
         )
         self._barrier = ObstacleLimit(arm, settings.clearance, settings.barrier_gain, settings.barrier_reach)
         self._contacts = tuple(
-            make(robot, body, settings.clearance, settings.contact_gain)
-            for make in (ContactLimit.table, ContactLimit.itself)
+            make(robot, settings.clearance, settings.contact_gain) for make in (ContactLimit.table, ContactLimit.itself)
         )
         self._kept: tuple[Array, ...] = ()
         """Distances that are kept, for each of these."""
         bounds = robot.lower, robot.upper, robot.velocity_limits
-        self._limited = LimitedArm(robot.records, arm.links.spheres, *bounds, settings.acceleration)
+        self._limited = LimitedArm(robot.records, robot.links.spheres, *bounds, settings.acceleration)
 
     def keep(self, q: Array) -> None:
-        """Keep the distances from the table, and of the arm's parts, of a motion along postures q (N, 6)."""
+        """Keep the distances from the table, and of the arm's parts, of a motion along postures q (N, n)."""
         self._kept = tuple(limit.kept(q) for limit in self._contacts)
 
     def tick(
@@ -78,15 +75,15 @@ class FeasibleVelocities:
         """Find the velocity for a tick.
 
         Args:
-            q: (6,) rad.
-            wanted: (6,) rad/s.
+            q: (n,) rad.
+            wanted: (n,) rad/s.
             dt: duration of the tick, seconds.
             before: the last tick; None before the first one, when the robot stands still.
             seen: the obstacles.
             late: time since they were seen, seconds.
         """
-        velocity = np.zeros(NUM_JOINTS) if before is None else before.velocity
-        lower, upper = np.full(NUM_JOINTS, -np.inf), np.full(NUM_JOINTS, np.inf)
+        velocity = np.zeros(len(q)) if before is None else before.velocity
+        lower, upper = np.full(len(q), -np.inf), np.full(len(q), np.inf)
         for limit in self._limits:  # the last one's bounds, of acceleration, come first
             lowest, highest = limit.bounds(q, velocity, dt)
             lower, upper = _within(lower, lowest, highest), _within(upper, lowest, highest)
@@ -103,17 +100,17 @@ class FeasibleVelocities:
     def _evasive(
         self, q: Array, velocity: Array, wanted: Array, before: Array | None, seen: Sighting, late: float, floor: float
     ) -> Array | None:
-        """Find the velocity (6,) that leads past obstacles which move; None where the wanted one does.
+        """Find the velocity (n,) that leads past obstacles which move; None where the wanted one does.
 
         Each of some velocities is foreseen for a short time: the joints turn to it as fast as they may and keep it, the
         obstacles go on as `ObstacleMotion` says. How near they come, in deviations of the obstacles from there, is its
         worth. Choosing anew in each tick, that is model predictive control with one move, by enumeration.
 
         Args:
-            q: (6,) rad.
-            velocity: (6,) now, rad/s.
-            wanted: (6,) rad/s.
-            before: (6,) the one of the last tick, rad/s; None is none.
+            q: (n,) rad.
+            velocity: (n,) now, rad/s.
+            wanted: (n,) rad/s.
+            before: (n,) the one of the last tick, rad/s; None is none.
             seen: the obstacles.
             late: time since they were seen, seconds.
             floor: distance from the table that is to be kept, metres.
@@ -146,25 +143,25 @@ class FeasibleVelocities:
 
 
 def _nearest(wanted: Array, lower: Array, upper: Array, rows: Sequence[Sequence[Array]]) -> Array:
-    """Find the velocity nearest to a wanted one (6,), min ‖q̇ − q̇*‖².
+    """Find the velocity nearest to a wanted one (n,), min ‖q̇ − q̇*‖².
 
-    Bounds (6,) are hard; rows of slopes s and bounds b, s·q̇ ≥ b, give way where there is no other way.
+    Bounds (n,) are hard; rows of slopes s and bounds b, s·q̇ ≥ b, give way where there is no other way.
     """
     nearest = _within(wanted, lower, upper)
     if all((slopes @ nearest >= bounds).all() for slopes, bounds in rows):
         return nearest
     slopes, bounds = (np.concatenate(parts) for parts in zip(*rows, strict=True))
     solution, _, flag, _ = daqp.solve(
-        np.eye(NUM_JOINTS),
+        np.eye(len(wanted)),
         -wanted,
         np.ascontiguousarray(slopes),
         np.concatenate([upper, np.full(len(bounds), 1e30)]),
         np.concatenate([lower, bounds]),
-        np.repeat(np.array([0, SOFT], np.int32), (NUM_JOINTS, len(bounds))),
+        np.repeat(np.array([0, SOFT], np.int32), (len(wanted), len(bounds))),
     )
-    return _within(solution if flag > 0 else np.zeros(NUM_JOINTS), lower, upper)
+    return _within(solution if flag > 0 else np.zeros(len(wanted)), lower, upper)
 
 
 def _within(values: Array, lower: Array, upper: Array) -> Array:
-    """Clip values (6,); for so few `np.clip` takes five times as long."""
+    """Clip values (n,); for so few `np.clip` takes five times as long."""
     return np.minimum(np.maximum(values, lower), upper)

@@ -11,7 +11,6 @@ from dt_viz.control.obstacle_motion import Sighting
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.kernels.proximity import contacts, least_contacts, proximity
 from dt_viz.obstacles.shapes import records
-from dt_viz.robot.body_points import BodyPoints
 from dt_viz.robot.robot import Robot
 
 NUM_POINTS = 8
@@ -24,8 +23,6 @@ STEADIEST = 0.5
 """Part of a distance that goes in one tick at most, however long it is."""
 JOINTS_BETWEEN = 3
 """Number of joints between two parts of the arm from which on they can touch: fewer do not fold them that far."""
-FASTEST = 1.3
-"""Speed, m/s, at which links approach the table at most, each joint at its limit; each other at 0.83."""
 
 
 @dataclass(frozen=True)
@@ -33,10 +30,10 @@ class VelocityLimit:
     """|q̇| ≤ the limit of each joint."""
 
     limits: Array
-    """(6,) rad/s."""
+    """(n,) rad/s."""
 
     def bounds(self, q: Array, velocity: Array, dt: float) -> tuple[Array, Array]:
-        """Lowest and highest velocities (6,), rad/s, in a tick of `dt` seconds after `velocity` (6,) at q (6,)."""
+        """Lowest and highest velocities (n,), rad/s, in a tick of `dt` seconds after `velocity` (n,) at q (n,)."""
         return -self.limits, self.limits
 
 
@@ -65,7 +62,7 @@ class RangeLimit:
         return -self._fastest(q - self.robot.lower, dt), self._fastest(self.robot.upper - q, dt)
 
     def _fastest(self, room: Array, dt: float) -> Array:
-        """Velocities v (6,) towards limits `room` (6,) away after which braking at b suffices: room − v·dt = v²/2b."""
+        """Velocities v (n,) towards limits `room` (n,) away after which braking at b suffices: room − v·dt = v²/2b."""
         b = BRAKING_SHARE * self.acceleration
         return np.where(room > 0, b * (np.sqrt(dt * dt + 2 * np.maximum(room, 0) / b) - dt), room / dt)
 
@@ -88,11 +85,11 @@ class ObstacleLimit:
     """Distance from which on a body point has a barrier, metres."""
 
     def rows(self, q: Array, seen: Sighting, dt: float) -> tuple[Array, Array, float]:
-        """Slopes s (K, 6) and bounds b (K,) with s·q̇ ≥ b at q (6,), and the distance from the nearest obstacle."""
+        """Slopes s (K, n) and bounds b (K,) with s·q̇ ≥ b at q (n,), and the distance from the nearest obstacle."""
         if seen.avoidance is None or not seen.avoidance.avoided.parts:
             return np.empty((0, len(q))), np.empty(0), np.inf
         shapes, values = records(seen.avoidance.avoided.parts)
-        robot, links = self.arm.robot, self.arm.links
+        robot, links = self.arm.robot, self.arm.robot.links
         part, distance, slopes, outward = proximity(robot.records, links.spheres, shapes, values, q, self.reach)
         if not len(distance):
             return slopes, distance, np.inf
@@ -112,7 +109,6 @@ class ContactLimit:
     name: str
     """What is not touched."""
     robot: Robot
-    body: BodyPoints
     pairs: Indices
     """(M, 2) as in `dt_viz.kernels.proximity.contacts`."""
     clearance: float
@@ -121,25 +117,25 @@ class ContactLimit:
     """γ, 1/s."""
 
     @classmethod
-    def table(cls, robot: Robot, body: BodyPoints, clearance: float, gain: float) -> ContactLimit:
+    def table(cls, robot: Robot, clearance: float, gain: float) -> ContactLimit:
         """Limit of the links above the table z = 0."""
-        links = body.indices[body.joint > 0]
-        return cls("the table", robot, body, np.stack([np.full(len(links), -1), links], axis=1), clearance, gain)
+        links = robot.body.indices[robot.body.joint >= robot.num_fixed]
+        return cls("the table", robot, np.stack([np.full(len(links), -1), links], axis=1), clearance, gain)
 
     @classmethod
-    def itself(cls, robot: Robot, body: BodyPoints, clearance: float, gain: float) -> ContactLimit:
+    def itself(cls, robot: Robot, clearance: float, gain: float) -> ContactLimit:
         """Limit of the links' distances from each other and the base."""
-        a, b = np.nonzero(body.joint[:, None] + JOINTS_BETWEEN <= body.joint)
-        return cls("itself", robot, body, body.indices[np.stack([a, b], axis=1)], clearance, gain)
+        return cls("itself", robot, robot.pairs(JOINTS_BETWEEN), clearance, gain)
 
     def kept(self, q: Array) -> Array:
-        """Distances (M,) to keep in a motion whose undisturbed postures are q (N, 6), metres."""
-        return least_contacts(self.robot.records, self.body.spheres, self.pairs, np.array(q, order="C"), self.clearance)
+        """Distances (M,) to keep in a motion whose undisturbed postures are q (N, n), metres."""
+        spheres, postures = self.robot.body.spheres, np.array(q, order="C")
+        return least_contacts(self.robot.records, spheres, self.pairs, postures, self.clearance)
 
     def rows(self, q: Array, kept: Array, dt: float) -> tuple[Array, Array]:
-        """Slopes s (K, 6) and bounds b (K,) with s·q̇ ≥ b at q (6,) where distances (M,) are kept."""
-        reach = self.clearance + FASTEST / min(self.gain, STEADIEST / dt)
-        which, apart, slopes = contacts(self.robot.records, self.body.spheres, self.pairs, q, reach)
+        """Slopes s (K, n) and bounds b (K,) with s·q̇ ≥ b at q (n,) where distances (M,) are kept."""
+        reach = self.clearance + self.robot.top_speed / min(self.gain, STEADIEST / dt)
+        which, apart, slopes = contacts(self.robot.records, self.robot.body.spheres, self.pairs, q, reach)
         near, bounds = _barrier(apart - kept[which], slopes, self.gain, dt)
         return slopes[near], bounds
 

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from dt_viz.robot.sizing import scales
+
 
 @dataclass(frozen=True)
 class ControllerSettings:
-    """Settings of `dt_viz.control.controller.ArmController`."""
+    """Settings of `dt_viz.control.controller.ArmController`.
+
+    `scales` marks what is given for an arm as large as the JACO, and scales with an arm's reach.
+    """
 
     acceleration: float = 4.0
     """Limit of the joints' acceleration, rad/s². The arm's URDF names none; joints then reach their limits of velocity,
@@ -36,7 +41,7 @@ class ControllerSettings:
     margin."""
     barrier_gain: float = 5.0
     """γ, 1/s: the distance beyond that clearance falls at most at this rate."""
-    barrier_reach: float = 0.25
+    barrier_reach: float = scales(0.25)
     """Distance from which on an obstacle slows the arm down, metres."""
     contact_gain: float = 20.0
     """γ, 1/s, of the distances from the table and between links: large, since neither moves, so that a motion along
@@ -67,7 +72,7 @@ class ControllerSettings:
     """Gain in distance, in deviations, from which on another way of dodging is taken."""
     homing_speed: float = 2.0
     """Speed of the way home, relative to that of the learned motion."""
-    holding_speed: float = 0.25
+    holding_speed: float = scales(0.25)
     """Speed at which the hand follows whoever holds it, m/s."""
     shove_time: float = 0.3
     """Duration of a shove, seconds, if the joints can be as fast."""
@@ -89,9 +94,8 @@ class ControllerSettings:
     """Deviation of a joint from where it was sent, rad, from which on somebody else has moved the robot."""
     at_rest: float = 1e-3
     """Gap, rad, and velocity, rad/s, of joints that count as at rest."""
-    aside: float = 5e-3
-    """Displacement, metres by `avoidance.arm_field.LEVERS`, from which on a robot at rest counts as having stepped
-    aside."""
+    aside: float = scales(5e-3)
+    """Displacement, metres by `Robot.levers`, from which on a robot at rest counts as having stepped aside."""
     touching: float = 5e-3
     """Depth of a body point in an obstacle that counts as touching, metres."""
     range_tolerance: float = 0.01

@@ -17,7 +17,7 @@ the arm follows it. The npz file holds for each place with N obstacles and R sta
 ``hand``, ``arm``, ``hand_without``, ``arm_without``, ``frechet``, … (K, R)
     the fields of `Rollout`; NaN where there is no motion.
 
-With ``--obstacle`` it also holds of each rollout i ``q_i`` (T, 6), rad, continuous joints unwrapped, ``times_i`` (T,),
+With ``--obstacle`` it also holds of each rollout i ``q_i`` (T, n), rad, continuous joints unwrapped, ``times_i`` (T,),
 seconds, ``x_i`` (T, 3), the end effector at these, and ``demo_i`` (T_i, 3), its demonstration, metres.
 """
 
@@ -57,7 +57,6 @@ from dt_viz.numerics import unit
 from dt_viz.obstacles.occupancy import GENERATORS
 from dt_viz.obstacles.shapes import UPRIGHT, Box, Cylinder, Obstacle, Quaternion, Sphere, as_point
 from dt_viz.obstacles.union import Union
-from dt_viz.robot.collision import load_collision_model
 from dt_viz.robot.inverse_kinematics import UnreachableError
 from dt_viz.scenario.tasks import Task
 from dt_viz.session.engine import ArmMotion, Engine
@@ -208,7 +207,7 @@ def _measured(engine: Engine, task: Task, obstacles: Sequence[Obstacle], options
     frame, motions = engine.arm_motions(scenario)
     if frame.blocked:
         return Place(obstacle, avoidance, ends, {}, {}, frame.blocked)
-    solved, robot, model = engine.solved(scenario, FINE), engine.follower.robot, load_collision_model()
+    solved, robot = engine.solved(scenario, FINE), engine.follower.robot
     if scenario.arm_avoidance is None:
         paths, without = _finely(solved.stack), solved.nominal.paths
     else:
@@ -220,9 +219,9 @@ def _measured(engine: Engine, task: Task, obstacles: Sequence[Obstacle], options
         outside = (motion.q < robot.lower - rounding) | (motion.q > robot.upper + rounding)
         rollouts[i] = Rollout(
             hand=_clearance(path, obstacle),
-            arm=model.nearest_to_obstacle(motion.q, obstacle).distance,
+            arm=robot.collision.nearest_to_obstacle(motion.q, obstacle).distance,
             hand_without=_clearance(undisturbed, obstacle),
-            arm_without=model.nearest_to_obstacle(motion.without, obstacle).distance,
+            arm_without=robot.collision.nearest_to_obstacle(motion.without, obstacle).distance,
             frechet=float(frechet([path], [task.paths[i]])[0]),
             detour=float(frechet([path], [undisturbed])[0]),
             turn=sharpest_turn(path, TURN_ARC),

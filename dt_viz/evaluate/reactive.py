@@ -3,7 +3,7 @@
 An obstacle's path has its middle at the hand of the undisturbed motion, and the obstacle is there when the hand would
 be. The npz file holds for run i:
 
-``q_i`` (T, 6), ``t_i`` (T,), ``obstacle_i`` (T, 3), or (T, P, 3) for P > 1 obstacles
+``q_i`` (T, n), ``t_i`` (T,), ``obstacle_i`` (T, 3), or (T, P, 3) for P > 1 obstacles
     joint angles, rad, seconds, and the obstacle's centre, metres, at each tick; NaN while it is not there.
 ``wxyz_i`` (P, 4)
     orientations of boxes.
@@ -45,7 +45,6 @@ from dt_viz.motion.following import Follower
 from dt_viz.motion.solve import Solved
 from dt_viz.motion.stack import LIVE
 from dt_viz.obstacles.shapes import UPRIGHT, Box, Obstacle, Quaternion, Sphere, as_point, as_quaternion
-from dt_viz.robot.collision import load_collision_model
 from dt_viz.robot.robot import Robot
 from dt_viz.session.engine import Engine
 
@@ -67,7 +66,7 @@ class CrossingSettings:
     box: tuple[float, float, float] = (1.0, 0.8, 0.6)
     """Sides of a box, in diameters."""
     pedestal_room: float = 0.10
-    """Distance that a path keeps from the base and link 1, which no joint moves out of its way."""
+    """Distance that a path keeps from the base and the first links, which no joint moves out of its way."""
     table_room: float = 0.01
     """Height of the obstacle above the table."""
     start_room: float = 0.05
@@ -176,7 +175,7 @@ class Bench:
         return tuple(self.shape(place, passage.wxyz) for passage, place in places if np.isfinite(place[0]))
 
     def undisturbed(self, start: int) -> tuple[Array, Array]:
-        """The hand's places (T, 3), metres, and joints (T, 6) at all ticks without a sphere."""
+        """The hand's places (T, 3), metres, and joints (T, n) at all ticks without a sphere."""
         controller, q, passed = ArmController(self.follower, self.solved), self.starts[start], []
         while len(passed) < SETTINGS.longest / TICK:
             passed.append(q)
@@ -212,11 +211,11 @@ def _drawn(
     Args:
         bench: its robot.
         hand: (T, 3) at all ticks of the undisturbed motion, metres.
-        joints: (T, 6) there, rad.
+        joints: (T, n) there, rad.
         speed: of the obstacle, m/s.
         rng: what it is drawn by.
     """
-    body, wall = bench.follower.whole_arm, bench.follower.body.on_pedestal
+    body, wall = bench.follower.whole_arm, bench.robot.pedestal
     pedestal = wall.positions(bench.robot, bench.starts[0])
     while True:
         at = int(rng.uniform(0.25, 0.75) * len(hand))
@@ -285,7 +284,7 @@ def room_at_coming(bench: Bench, run: Run, crossing: Crossing) -> float:
 
 def smallest_distance(bench: Bench, run: Run, crossing: Crossing) -> float:
     """Smallest distance of the arm's meshes from the obstacles, at the ticks and at five places between two, metres."""
-    cover, model, best = bench.follower.body, load_collision_model(), np.inf
+    cover, model, best = bench.robot.body, bench.robot.collision, np.inf
     for passage, centres in zip(crossing.passages, np.array(run.obstacle).transpose(1, 0, 2), strict=True):
         (there,) = np.nonzero(np.isfinite(centres[:, 0]))
         finely = np.linspace(there[0], there[-1], 6 * (len(there) - 1) + 1)

@@ -9,7 +9,7 @@ in its usual posture at every start and goal of the demonstrations: each method 
 ``DIR/table1.json`` holds ``{method: {task: {column: {"mean", "worst", "paper"}}}}`` in metres and seconds, over all
 places and rollouts; ``paper`` is the paper's value, null where there is none. ``DIR/METHOD_TASK.npz`` holds what
 the cells are made from: ``obstacle_k`` (4,), centre and diameter of the sphere at place k; ``x_k_i``, ``t_k_i`` and
-``q_k_i``, the path (N, 3), its times (N,) and the arm's postures (M, 6) along it, of the rollout from start i;
+``q_k_i``, the path (N, 3), its times (N,) and the arm's postures (M, n) along it, of the rollout from start i;
 ``demo_i`` (T, 3), its demonstration, and ``demo_t_i``; one array (K, R) for each column, of motions from the starts;
 ``perturbed_k`` (P, 3) and ``ends_k`` (P, 3), perturbed starts and where their motions end. Columns:
 
@@ -66,8 +66,8 @@ from dt_viz.metrics import (
 )
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
-from dt_viz.robot.collision import load_collision_model
 from dt_viz.robot.inverse_kinematics import UnreachableError, track
+from dt_viz.robot.robot import Robot
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.comparison import curves
@@ -192,7 +192,7 @@ def drawn(problem: Problem, count: int, num_perturbed: int, seed: int) -> list[R
     Raises:
         InputError: the places are not found.
     """
-    task, model = problem.task, load_collision_model()
+    task, model = problem.task, problem.robot.collision
     rng, mean, undisturbed = np.random.default_rng(seed), task.mean_path, problem.learned.demonstrated.paths
     at_ends = np.concatenate([path[[0, -1]] for path in problem.postures])
     places: list[RandomPlace] = []
@@ -214,7 +214,7 @@ def drawn(problem: Problem, count: int, num_perturbed: int, seed: int) -> list[R
 
 def _perturbed(problem: Problem, sphere: Sphere, num: int, rng: np.random.Generator) -> Array:
     """Starts (num, 3), beside the demonstrated ones: reached by the arm, which is free there."""
-    starts, model, robot = problem.task.starts, load_collision_model(), problem.robot
+    starts, robot = problem.task.starts, problem.robot
     found: list[Array] = []
     for _ in range(SETTINGS.max_drawn):
         if len(found) == num:
@@ -222,7 +222,7 @@ def _perturbed(problem: Problem, sphere: Sphere, num: int, rng: np.random.Genera
         nearest = int(rng.integers(len(starts)))
         start = starts[nearest] + _in_ball(rng, SETTINGS.perturbed_by)
         posture = track(robot, start[None], problem.postures[nearest][0])
-        if posture.error[0] < 1e-3 and model.obstacle_distance(posture.q, sphere)[0].min() > 0:
+        if posture.error[0] < 1e-3 and robot.collision.obstacle_distance(posture.q, sphere)[0].min() > 0:
             found.append(start)
     return np.array(found).reshape(-1, 3)
 
@@ -249,7 +249,7 @@ def measured(planner: Planner, problem: Problem, places: Sequence[RandomPlace]) 
         rows = []
         for i, (x, t, q) in enumerate(zip(plan.paths, plan.times, joints_along(problem, plan), strict=True)):
             arrays |= {f"x_{k}_{i}": x, f"t_{k}_{i}": t, f"q_{k}_{i}": q}
-            rows.append(measure(x, t, q, task.paths[i], goal, place.obstacle))
+            rows.append(measure(problem.robot, x, t, q, task.paths[i], goal, place.obstacle))
         for value in fields(Measured):
             table[value.name].append([getattr(row, value.name) for row in rows])
         ends = _ends(planner, place)
@@ -262,18 +262,19 @@ def measured(planner: Planner, problem: Problem, places: Sequence[RandomPlace]) 
     return {**arrays, "goal": goal, **{column: np.array(values) for column, values in table.items()}}
 
 
-def measure(x: Array, t: Array, q: Array, demonstration: Array, goal: Array, obstacle: Union) -> Measured:
+def measure(robot: Robot, x: Array, t: Array, q: Array, demonstration: Array, goal: Array, obstacle: Union) -> Measured:
     """Measure one motion.
 
     Args:
+        robot: the arm.
         x: (N, 3) path of the end effector, metres.
         t: (N,) its times, seconds.
-        q: (M, 6) postures of the arm along it, rad.
+        q: (M, n) postures of the arm along it, rad.
         demonstration: (T, 3), metres.
         goal: (3,), metres.
         obstacle: what was to be avoided.
     """
-    nearest = load_collision_model().nearest_to_obstacle(q, obstacle)
+    nearest = robot.collision.nearest_to_obstacle(q, obstacle)
     path = x if len(x) > 1 else np.repeat(x, 2, axis=0)
     warped, matched = [resample_by_arc_length(p, 200) for p in (path, demonstration)]
     return Measured(
@@ -289,7 +290,7 @@ def measure(x: Array, t: Array, q: Array, demonstration: Array, goal: Array, obs
 
 
 def joints_along(problem: Problem, plan: Plan) -> tuple[Array, ...]:
-    """The arm's postures (N_i, 6), rad, along a plan: its own, or those that track its paths, as the demonstrations."""
+    """The arm's postures (N_i, n), rad, along a plan: its own, or those that track its paths, as the demonstrations."""
     if plan.joints is not None:
         return plan.joints
     return tuple(

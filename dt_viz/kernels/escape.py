@@ -36,6 +36,8 @@ class Escape(NamedTuple):
     points: BodyPoints
     hand: Array
     """(3,) position of the end effector in the last joint, metres."""
+    axis: Array
+    """(3,) direction of the hand there, of any length but 0."""
     shapes: Shapes
     values: Values
     sources: Array
@@ -151,14 +153,13 @@ def _touch(escape: Escape, k: int, block: Record) -> bool:
 @compiled
 def _hold(escape: Escape, block: Record) -> None:
     """Find √w_x Jᵀ and √w_d Dᵀ, which are R[:, :3] and R[:, 3:6]."""
-    n, hand = len(escape.joints), escape.hand
+    n, hand, axis = len(escape.joints), escape.hand, escape.axis
     place, tip, origins, scale = block.place, block.tip, block.origins, block.scale
     staying = np.sqrt(escape.hand_weight)
-    upright = np.sqrt(escape.direction_weight / (hand[0] ** 2 + hand[1] ** 2 + hand[2] ** 2))
-    put(hand, n - 1, block)
-    tip[:] = place
-    for column, weight in ((0, staying), (3, upright)):
-        scale[:] = weight
+    upright = np.sqrt(escape.direction_weight / (axis[0] ** 2 + axis[1] ** 2 + axis[2] ** 2))
+    for column, weight, offset in ((0, staying, hand), (3, upright, axis)):
+        put(offset, n - 1, block)
+        tip[:], scale[:] = place, weight
         for i in range(n):
             about = i if column == 0 else n - 1  # the direction is that from the last joint
             for c in range(3):

@@ -46,6 +46,8 @@ class TrackingArm(NamedTuple):
     joints: Joints
     hand: Array
     """(3,) position of the end effector in the last joint, metres."""
+    axis: Array
+    """(3,) direction of the hand there, of any length but 0."""
     lower: Array
     """(n,) rad."""
     upper: Array
@@ -139,15 +141,18 @@ def _newton(arm: TrackingArm, gain: float, block: Record) -> None:
 @compiled
 def _linearise(arm: TrackingArm, block: Record) -> None:
     """Find the error, and the derivatives J and D of the hand's place and direction."""
-    n, hand, axes, origins, place = len(arm.joints), arm.hand, block.axes, block.origins, block.place
+    n, axis, axes, origins, place = len(arm.joints), arm.axis, block.axes, block.origins, block.place
     target, error, direction, J, D = block.target, block.error, block.direction, block.J, block.D
-    length = np.sqrt(hand[0] ** 2 + hand[1] ** 2 + hand[2] ** 2)
+    length = np.sqrt(axis[0] ** 2 + axis[1] ** 2 + axis[2] ** 2)
     chain(arm.joints, block)
-    put(hand, n - 1, block)
+    put(axis, n - 1, block)
+    for c in range(3):
+        for lane in range(LANES):
+            direction[c, lane] = (place[c, lane] - origins[n - 1, c, lane]) / length
+    put(arm.hand, n - 1, block)
     for c in range(3):
         for lane in range(LANES):
             error[c, lane] = target[c, lane] - place[c, lane]
-            direction[c, lane] = (place[c, lane] - origins[n - 1, c, lane]) / length
     for i in range(n):
         for lane in range(LANES):
             x, y = place[0, lane] - origins[i, 0, lane], place[1, lane] - origins[i, 1, lane]

@@ -27,8 +27,8 @@ MAX_OFF = 1e-6
 """Distance of ψ of a sample from its base motion, metres, before it is said. The flows' integration leaves up to 1e-8;
 where a stack squeezes space most, five millimetres of what is shown are 2e-5."""
 MAX_OFF_POSTURE = 1e-5
-"""The same of ψ_q, by `LEVERS`: its flow, integrated to `POSTURE_TOLERANCE`, leaves up to 1e-6, and five millimetres
-are 4e-4 where it squeezes most."""
+"""The same of ψ_q, by `Robot.levers`: its flow, integrated to `POSTURE_TOLERANCE`, leaves up to 1e-6, and five
+millimetres are 4e-4 where it squeezes most."""
 POSTURE_TOLERANCE = 1e-7
 """Tolerance of a step of ψ_q's flow, rad, at every posture: half as costly as the one that the motion is made with."""
 MAX_OFF_TRACKED = 1e-3

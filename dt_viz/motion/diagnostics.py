@@ -7,7 +7,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from dt_viz.avoidance.arm_field import LEVERS
 from dt_viz.avoidance.start_status import StartStatus, start_warnings
 from dt_viz.avoidance.transform import Anchored, MotionBelow
 from dt_viz.flows.diffeomorphisms import Chain, Conjugated, Diffeomorphism, Flow, Integration
@@ -18,9 +17,9 @@ from dt_viz.motion.nominal import Nominal
 from dt_viz.motion.solve import Solved
 from dt_viz.motion.stack import Applied, Solution
 from dt_viz.robot.collision import Nearest
+from dt_viz.robot.robot import Robot
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import WHOLE_ARM
-from dt_viz.scenario.starts import REACH, SHOULDER
 from dt_viz.warning import ARM, Kind, MotionWarning, in_millimetres
 
 MAX_GOAL_MISS = 1e-3
@@ -31,8 +30,8 @@ NUM_CHECKED_LIVE = 300
 """Number of samples on which it is computed what an integrator costs that was chosen by hand."""
 
 
-def motion_warnings(solved: Solved, drawn: DrawnSamples) -> tuple[MotionWarning, ...]:
-    """Why the motion that is drawn is not to be trusted."""
+def motion_warnings(solved: Solved, drawn: DrawnSamples, robot: Robot | None = None) -> tuple[MotionWarning, ...]:
+    """Why the motion that is drawn, of a robot or the hand alone, is not to be trusted."""
     nominal, scenario, stack, arm = solved.nominal, solved.scenario, solved.stack, solved.arm
     missed = float(np.linalg.norm(drawn.positions[-1] - nominal.goal))
     warnings = [MotionWarning(Kind.IMITATION, text) for text in nominal.imitation.warnings]
@@ -40,7 +39,7 @@ def motion_warnings(solved: Solved, drawn: DrawnSamples) -> tuple[MotionWarning,
     if max(len(stack.bundle.index), len(arm.index) if arm else 0) >= MAX_SAMPLES:
         text = "the motions are stretched too far to be sampled closely: what is drawn cuts corners"
         warnings.append(MotionWarning(Kind.UNSAMPLED, text))
-    integration = _of_integration(solved)
+    integration = _of_integration(solved, robot)
     if scenario.warp < 1:  # wishes that are not met yet are no failures
         return (*warnings, *integration, *nominal.warnings)
     if arm is not None:
@@ -75,17 +74,18 @@ def _of_arm(solved: Solved) -> list[MotionWarning]:
     return [*warnings, *start_warnings(beside, nominal.added, Kind.START_COVERED, how, WHOLE_ARM)]
 
 
-def anchor_warnings(stack: Solution) -> tuple[MotionWarning, ...]:
-    """Warnings about transforms that lead motions to where the arm's hand cannot be."""
+def anchor_warnings(stack: Solution, robot: Robot) -> tuple[MotionWarning, ...]:
+    """Warnings about transforms that lead motions to where a robot's hand cannot be."""
     said = []
     for name, transform in ((applied.name, applied.transform) for applied in stack.built):
         if not isinstance(transform, Anchored):
             continue
         if transform.position[2] < 0:
             said.append((name, "the point is below the table"))
-        away = float(np.linalg.norm(np.subtract(transform.position, SHOULDER)))
-        if away > REACH:
-            said.append((name, f"the point is {away:.2f} m from the arm's shoulder, which reaches {REACH:.2f} m"))
+        away = float(np.linalg.norm(np.subtract(transform.position, robot.shoulder)))
+        if not robot.reaches(transform.position):
+            reach = f"which reaches {robot.working_radius:.2f} m"
+            said.append((name, f"the point is {away:.2f} m from the arm's shoulder, {reach}"))
     return tuple(MotionWarning(Kind.MISPLACED, f"{name}: {text}", name) for name, text in said)
 
 
@@ -129,15 +129,16 @@ def margin_warnings(scenario: Scenario, nearest: Mapping[int, Nearest]) -> tuple
     return (MotionWarning(Kind.ARM_TOO_NEAR, text, ARM),)
 
 
-def _of_integration(solved: Solved) -> tuple[MotionWarning, ...]:
+def _of_integration(solved: Solved, robot: Robot | None) -> tuple[MotionWarning, ...]:
     """Warnings about integrators that were chosen by hand."""
     stack, arm, avoidance = solved.stack, solved.arm, solved.scenario.arm_avoidance
     warnings, bundle = [], stack.bundle
     for level, applied in enumerate(stack.built, 1):
         y, x, made = bundle.levels[:, level], bundle.levels[:, level - 1], applied.made
         warnings += integration_warnings(applied.name, made.transform, made.integration, y, x)
-    if arm is not None and avoidance is not None:
-        warnings += integration_warnings(WHOLE_ARM, arm.transform, avoidance.integration, arm.p, arm.q, LEVERS)
+    if robot is not None and arm is not None and avoidance is not None:
+        transform, levers = arm.transform, robot.levers
+        warnings += integration_warnings(WHOLE_ARM, transform, avoidance.integration, arm.p, arm.q, levers)
     return tuple(warnings)
 
 

@@ -19,9 +19,8 @@ from dt_viz.metrics import arc_length
 from dt_viz.motion.nominal import Learned, Nominal, NominalTrajectory
 from dt_viz.motion.stack import Solution
 from dt_viz.obstacles.union import Union
-from dt_viz.robot.body_points import load_body_points
 from dt_viz.robot.inverse_kinematics import TrackedPath, UnreachableError, drawn_onto, inverse_kinematics, track
-from dt_viz.robot.robot import NUM_JOINTS, Robot
+from dt_viz.robot.robot import Robot
 from dt_viz.scenario.scenario import MAX_STARTS
 from dt_viz.scenario.tasks import Task
 from dt_viz.warning import ARM, Kind, MotionWarning
@@ -47,9 +46,9 @@ class ArmMotion:
     times: Array
     """(T,) seconds, later than the rollout's where the joints' velocity limits ask for it."""
     q: Array
-    """(T, 6) joint angles at these times, rad; continuous joints unwrapped."""
+    """(T, n) joint angles at these times, rad; continuous joints unwrapped."""
     without: Array
-    """(T, 6) the same at the same moments of the motion without avoidance."""
+    """(T, n) the same at the same moments of the motion without avoidance."""
 
 
 @dataclass(frozen=True)
@@ -74,8 +73,7 @@ class Follower:
             shared: what keeps the reference postures of tasks, for other followers, too.
         """
         self.robot = robot
-        self.body = load_body_points()
-        self.whole_arm = WholeArm(robot, self.body)
+        self.whole_arm = WholeArm(robot)
         self._memo = Memo() if memo is None else memo
         self._shared = Memo() if shared is None else shared
 
@@ -107,7 +105,7 @@ class Follower:
         return self._memo("added", (trajectory, reference.tobytes()), lifted, newest=NEWEST)
 
     def reference(self, nominal: Nominal) -> Array:
-        """The posture (6,), rad, that the arm stays near to.
+        """The posture (n,), rad, that the arm stays near to.
 
         Raises:
             UnreachableError: the arm cannot get to where the motions start.
@@ -211,12 +209,12 @@ class Follower:
 
     def _pedestal_touched(self, learned: Learned, obstacle: Union) -> tuple[MotionWarning, ...]:
         """Warnings about what touches the links that no joint carries away."""
-        posture, pedestal = self._demonstrated(learned).pins[:1], self.body.on_pedestal
-        if pedestal.clearance(self.robot, posture, obstacle, 0.0) >= 0:
-            return ()
-        name = "base" if self.body.of_joints(-1, 0).clearance(self.robot, posture, obstacle, 0.0) < 0 else "link 1"
-        text = f"the obstacle touches the arm's {name}, which cannot move away"
-        return (MotionWarning(Kind.ARM_BLOCKED, text, ARM),)
+        posture, robot = self._demonstrated(learned).pins[:1], self.robot
+        for joint, _ in robot.pedestal.by_joint:
+            if robot.body.of_joints(joint, joint + 1).clearance(robot, posture, obstacle, 0.0) < 0:
+                text = f"the obstacle touches the arm's {robot.link_name(joint)}, which cannot move away"
+                return (MotionWarning(Kind.ARM_BLOCKED, text, ARM),)
+        return ()
 
     def _ranked(
         self, learned: Learned, obstacle: Union, margin: float, last: Posture | None, *, keeps: bool
@@ -254,8 +252,8 @@ class Follower:
         usual, paths = self._demonstrated(learned).reference, learned.demonstrated.paths
         return self._shared(
             "reference_postures",
-            learned,
-            lambda: reference_postures(self.robot, self.body, usual, learned.task.starts, _mean(paths)),
+            (self.robot, learned),
+            lambda: reference_postures(self.robot, usual, learned.task.starts, _mean(paths)),
         )
 
     def out_of_reach(self, nominal: Nominal) -> Mask:
@@ -294,7 +292,7 @@ class Follower:
             fractions = bundle.fraction.reshape(len(starts), -1)[:, stride]
             return lift(self.robot, fractions, bundle.positions.reshape(len(starts), -1, 3)[:, stride], reference)
 
-        found = self._shared("demonstrated", (learned, posture), lifted, newest=NUM_POSTURES)
+        found = self._shared("demonstrated", (self.robot, learned, posture), lifted, newest=NUM_POSTURES)
         if isinstance(found, UnreachableError):
             raise found
         return found
@@ -334,6 +332,6 @@ def room_at_rest(robot: Robot, task: Task, obstacle: Union, places: Array) -> Ar
         UnreachableError: the arm cannot get to the task's starts, near whose posture it stays.
     """
     reference = inverse_kinematics(robot, task.starts.mean(axis=0))
-    start = np.broadcast_to(reference, (len(places), NUM_JOINTS))
+    start = np.broadcast_to(reference, (len(places), robot.num_joints))
     postures = track(robot, places[:, None], start, reference=start).q[:, 0]
-    return WholeArm(robot, load_body_points()).clearance(postures, obstacle)
+    return WholeArm(robot).clearance(postures, obstacle)

@@ -16,7 +16,7 @@ from dt_viz.flows.fields import Array, Mask
 from dt_viz.obstacles.union import Union
 from dt_viz.pictures.slice_fields import FieldPicture
 from dt_viz.robot.inverse_kinematics import track
-from dt_viz.robot.robot import NUM_JOINTS, Robot
+from dt_viz.robot.robot import Robot
 
 STEP = 4e-3
 """Length of the steps that derivatives are taken from, metres at the hand."""
@@ -31,9 +31,9 @@ class Lattice:
     reached: Mask
     """(M,) which of the places are within the arm's reach."""
     postures: Array
-    """(N, 6) Q at the reached ones, rad."""
+    """(N, n) Q at the reached ones, rad."""
     derivatives: Array
-    """(N, 6, 3) DQ there, rad/m."""
+    """(N, n, 3) DQ there, rad/m."""
 
     @classmethod
     def of(cls, points: Array, robot: Robot, reference: Array) -> Lattice:
@@ -42,10 +42,10 @@ class Lattice:
         Args:
             points: (M, 3) places of the hand, metres.
             robot: the arm.
-            reference: (6,) posture that it stays near to, rad.
+            reference: (n,) posture that it stays near to, rad.
         """
         paths = points[:, None] + np.concatenate([np.zeros((1, 3)), STEP * np.eye(3)])
-        start = np.broadcast_to(reference, (len(paths), NUM_JOINTS))
+        start = np.broadcast_to(reference, (len(paths), robot.num_joints))
         tracked = track(robot, paths, start, reference=start)
         reached = tracked.error.max(axis=1) <= MAX_MISS
         q = tracked.q[reached]

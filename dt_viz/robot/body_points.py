@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.kernels.arm import BODY_POINT
 from dt_viz.kernels.blocks import clearance
-from dt_viz.kernels.proximity import least_contacts
 from dt_viz.obstacles.shapes import Obstacle, records
 from dt_viz.obstacles.union import Union
-from dt_viz.robot.robot import NUM_JOINTS, KinematicChain, Robot
-from dt_viz.shipped import ASSETS
+from dt_viz.robot.kinematics import KinematicChain, Kinematics
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -64,25 +62,15 @@ class BodyPoints:
         """(P,) radii of the spheres around the points, metres."""
         return self.spheres["radius"][self.indices]
 
-    @cached_property
-    def on_moving_links(self) -> BodyPoints:
-        """Points that joints can move away from an obstacle: not those of the base and of link 1, which only spins."""
-        return self.of_joints(1, NUM_JOINTS)
-
-    @cached_property
-    def on_pedestal(self) -> BodyPoints:
-        """Points of the base and link 1, which no motion moves away from anything."""
-        return self.of_joints(-1, 1)
-
-    def with_end_effector(self, robot: Robot) -> BodyPoints:
+    def with_end_effector(self, robot: Kinematics) -> BodyPoints:
         """The same and the robot's end effector, a point that keeps clear, too, for what the hand holds."""
-        hand = (NUM_JOINTS - 1, robot.end_effector_offset, 0.0, len(self.spheres) + 1)
+        hand = (robot.num_joints - 1, robot.end_effector_offset, 0.0, len(self.spheres) + 1)
         return BodyPoints(np.append(self.spheres, np.array(hand, BODY_POINT)))
 
-    def of_joints(self, first: int, end: int) -> BodyPoints:
-        """Those of the joints before `end`, from the first one on."""
-        begin, end = np.searchsorted(self.spheres["joint"], [first, end])
-        spheres = self.spheres[begin:end].copy()
+    def of_joints(self, first: int, end: float = np.inf) -> BodyPoints:
+        """Those of the joints before `end`, from the first one on; −1 is the base."""
+        begin, stop = np.searchsorted(self.spheres["joint"], [first, end])
+        spheres = self.spheres[begin:stop].copy()
         spheres["end"] -= begin
         return BodyPoints(spheres)
 
@@ -101,13 +89,13 @@ class BodyPoints:
 
     def clearance(
         self,
-        robot: Robot,
+        robot: Kinematics,
         q: Array,
         obstacle: Union | Obstacle,
         highest: ArrayLike = np.inf,
         lowest: ArrayLike = -np.inf,
     ) -> Array:
-        """Compute distances (N,), metres, of the arm from an obstacle at configurations q (N, 6), rad.
+        """Compute distances (N,), metres, of the arm from an obstacle at configurations q (N, n), rad.
 
         They are too small by `PROTRUSION` at most, and cut off at `lowest` and `highest`, each (N,) or one for all.
         """
@@ -115,37 +103,13 @@ class BodyPoints:
         low, high = (np.array(np.broadcast_to(bound, len(q)), dtype=float) for bound in (lowest, highest))
         return clearance(robot.records, self.spheres, shapes, values, np.array(q, order="C"), low, high)
 
-    def self_clearance(self, robot: Robot, q: Array, enough: float) -> float:
-        """Compute the smallest distance, metres, of links that no joint connects at configurations q (N, 6), rad.
-
-        It is too small by twice `PROTRUSION` at most, and at most `enough`.
-        """
-        a, b = np.nonzero(self.joint[:, None] + 1 < self.joint)
-        pairs = self.indices[np.stack([a, b], axis=1)]
-        return float(least_contacts(robot.records, self.spheres, pairs, np.array(q, order="C"), enough).min())
-
     @cached_property
     def by_joint(self) -> list[tuple[int, slice]]:
         """Joints that have points, each with the slice of its points."""
-        bounds = np.searchsorted(self.joint, np.arange(-1, NUM_JOINTS + 1))
-        return [(j, slice(a, b)) for j, a, b in zip(range(-1, NUM_JOINTS), bounds, bounds[1:], strict=False) if b > a]
+        joints, begins = np.unique(self.joint, return_index=True)
+        return [(int(j), slice(a, b)) for j, a, b in zip(joints, begins, [*begins[1:], len(self.joint)], strict=True)]
 
-    @cached_property
-    def is_beyond(self) -> Array:
-        """Matrix (6, P): 1 where a joint moves a point, else 0."""
-        return (self.joint >= np.arange(NUM_JOINTS)[:, None]).astype(float)
-
-    def positions(self, robot: Robot, q: Array) -> Array:
-        """Compute the positions (*B, P, 3), metres, at configurations q (*B, 6), rad."""
-        at = self.of_chain(robot.chain(q.reshape(-1, NUM_JOINTS).T))
+    def positions(self, robot: Kinematics, q: Array) -> Array:
+        """Compute the positions (*B, P, 3), metres, at configurations q (*B, n), rad."""
+        at = self.of_chain(robot.chain(q.reshape(-1, q.shape[-1]).T))
         return at.transpose(2, 0, 1).reshape(*q.shape[:-1], len(self.joint), 3)
-
-
-@lru_cache(maxsize=1)
-def load_body_points() -> BodyPoints:
-    """The JACO's body points, made by ``python -m assets.make_body_points``."""
-    with np.load(ASSETS / "body_points.npz", allow_pickle=False) as data:
-        spheres = np.zeros(len(data["joint"]), BODY_POINT)
-        for name in BODY_POINT.names or ():
-            spheres[name] = data[name]
-    return BodyPoints(spheres)

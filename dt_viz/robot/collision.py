@@ -9,15 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.union import Union
-from dt_viz.robot.link_distances import AboveTable, BetweenLinks, FromObstacle, Link, Measure, Poses
-from dt_viz.robot.robot import NUM_JOINTS, LinkMesh, Robot, collision_meshes, load_jaco
+from dt_viz.robot.kinematics import Kinematics
+from dt_viz.robot.link_distances import AboveTable, BetweenLinks, FromObstacle, Link, Measure, Poses, page_names
+from dt_viz.robot.meshes import LinkMesh
 from dt_viz.warning import ARM, Kind, MotionWarning
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 
 
 SELF_REACH = 0.05
-"""Distance of links beyond which it is not measured, metres: the wrist never has more than 7 cm between its ends."""
+"""Distance of links beyond which it is not measured, metres: between the ends of the JACO's wrist are at most 7 cm."""
 SELF_MARGIN = 0.01
 """Distance of links below which a problem is reported, metres."""
 KNOT_STRIDE = 4
@@ -117,8 +118,8 @@ class _Search:
     that moves the link by L it is at least (d₀ + d₁ − L)/2. Pieces that could hold less than the best are halved.
     """
 
-    def __init__(self, robot: Robot, measure: Measure, q: Array, travel: Array, ceiling: float) -> None:
-        """Take the path q (T, 6), bounds travel (T − 1, I) between its samples, and an upper bound of the result."""
+    def __init__(self, robot: Kinematics, measure: Measure, q: Array, travel: Array, ceiling: float) -> None:
+        """Take the path q (T, n), bounds travel (T − 1, I) between its samples, and an upper bound of the result."""
         self._robot, self._measure = robot, measure
         self._last = len(q) - 1
         self._q = q if self._last else np.repeat(q, 2, axis=0)  # a path of one sample becomes one that stays there
@@ -186,21 +187,29 @@ class CollisionModel:
     Attributes:
         robot: kinematics that places them.
         links: from the base to the finger tips.
+        num_fixed: number of first joints whose links stand on the table.
+        touching: pairs of links that may touch besides neighbours, by their names in the URDF.
     """
 
-    def __init__(self, robot: Robot, meshes: Sequence[LinkMesh]) -> None:
-        self.robot = robot
-        self.links = tuple(Link(mesh) for mesh in meshes)
+    def __init__(
+        self,
+        robot: Kinematics,
+        meshes: Sequence[LinkMesh],
+        num_fixed: int,
+        touching: frozenset[frozenset[str]] = frozenset(),
+    ) -> None:
+        self.robot, self.num_fixed, self.touching = robot, num_fixed, touching
+        self.links = tuple(map(Link, meshes, page_names([mesh.name for mesh in meshes])))
 
     @cached_property
     def reach(self) -> Array:
-        """Upper bounds (11, 6) of the distance of each link's points from each joint's axis in any posture, metres.
+        """Upper bounds (L, n) of the distance of each link's points from each joint's axis in any posture, metres.
 
         They are 0 for joints that do not move the link, and do not increase from one moving joint to the next.
         """
         steps = np.linalg.norm(self.robot.joint_translations, axis=1)
         sideways = np.linalg.norm(self.robot.joint_translations[:, :2], axis=1)
-        bounds = np.zeros((len(self.links), NUM_JOINTS))
+        bounds = np.zeros((len(self.links), self.robot.num_joints))
         for link, bound in zip(self.links, bounds, strict=True):
             joint = link.frame - 1
             if joint < 0:
@@ -216,7 +225,7 @@ class CollisionModel:
         """Compute the smallest signed distance of any point of the arm from the obstacle, and the nearest link.
 
         Args:
-            q: (T, 6) configurations, rad.
+            q: (T, n) configurations, rad.
             obstacle: in the base frame.
 
         Returns:
@@ -237,7 +246,7 @@ class CollisionModel:
         return distances, nearest
 
     def nearest_to_obstacle(self, q: ArrayLike, obstacle: Union | Obstacle) -> Nearest:
-        """Find the smallest signed distance of the arm from the obstacle on a path q (T, 6), rad.
+        """Find the smallest signed distance of the arm from the obstacle on a path q (T, n), rad.
 
         It is accurate to `link_distances.TOLERANCE` for a ball, for other shapes to `SHAPE_TOLERANCE`, inside to
         `RESOLUTION`.
@@ -250,23 +259,24 @@ class CollisionModel:
         return nearest
 
     def nearest_to_itself(self, q: ArrayLike) -> Nearest | None:
-        """Find the smallest distance of two links on a path q (T, 6), rad; None beyond `SELF_REACH`.
+        """Find the smallest distance of two links on a path q (T, n), rad; None beyond `SELF_REACH`.
 
-        It is accurate to `link_distances.SELF_TOLERANCE`. Links that a joint connects are left out.
+        It is accurate to `link_distances.SELF_TOLERANCE`. Links that a joint connects or that may touch are left out.
         """
-        return self._search(BetweenLinks(self.links), q, SELF_REACH)
+        measure = BetweenLinks(self.links, self.touching)
+        return self._search(measure, q, SELF_REACH) if len(measure.bodies) else None
 
     def nearest_to_table(self, q: ArrayLike) -> Nearest:
-        """Find the smallest height above the table z = 0 on a path q (T, 6), rad, to `link_distances.TOLERANCE`.
+        """Find the smallest height above the table z = 0 on a path q (T, n), rad, to `link_distances.TOLERANCE`.
 
-        The base and link 1, which stand on it, are left out.
+        The base and other links that stand on it are left out.
         """
-        found = self._search(AboveTable(self.links), q)
+        found = self._search(AboveTable(self.links, self.num_fixed), q)
         assert found is not None
         return found
 
     def report(self, q: ArrayLike, obstacle: Union | Obstacle) -> CollisionReport:
-        """Compute all distances on one path q (T, 6), rad."""
+        """Compute all distances on one path q (T, n), rad."""
         return CollisionReport(
             self.nearest_to_obstacle(q, obstacle), self.nearest_to_itself(q), self.nearest_to_table(q)
         )
@@ -276,7 +286,7 @@ class CollisionModel:
         return _Search(self.robot, measure, q, self._travel(measure, q), ceiling).run()
 
     def _travel(self, measure: Measure, q: Array) -> Array:
-        """Bound the distances (T − 1, I) that the items' points move from sample to sample of q (T, 6)."""
+        """Bound the distances (T − 1, I) that the items' points move from sample to sample of q (T, n)."""
         poses, turns = Poses.of(self.robot, q), np.abs(np.diff(q, axis=0))
         bounds = np.empty((len(turns), len(measure.bodies)))
         for k, (body, base) in enumerate(zip(measure.bodies, measure.bases, strict=True)):
@@ -292,9 +302,3 @@ class CollisionModel:
             displaced = np.linalg.norm(np.diff(corners, axis=0), axis=-1).max(axis=1)
             bounds[:, k] = np.minimum(at_most, displaced + at_most * turning.sum(axis=1) / 2)
         return bounds
-
-
-@lru_cache(maxsize=1)
-def load_collision_model() -> CollisionModel:
-    """Load the JACO's links, once."""
-    return CollisionModel(load_jaco(), collision_meshes())

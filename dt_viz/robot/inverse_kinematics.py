@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dt_viz.kernels.tracking import Postures, settle, walk
-from dt_viz.robot.robot import NUM_JOINTS, Robot
+from dt_viz.robot.robot import Robot
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -30,7 +30,7 @@ class TrackedPath:
     """A joint trajectory that follows an end-effector path.
 
     Attributes:
-        q: (*B, T, 6) joint angles, rad, inside the limits; continuous joints unwrapped.
+        q: (*B, T, n) joint angles, rad, inside the limits; continuous joints unwrapped.
         error: (*B, T) distance of the end effector from the path, metres.
         limits_hit: (*B, T) whether a joint was held at its limit.
         manipulability: (*B, T) sqrt det(J Jᵀ), m³.
@@ -58,20 +58,21 @@ def inverse_kinematics(
     Args:
         robot: the arm.
         target: (3,) metres, base frame.
-        seed: (6,) rad, posture to stay near; by default the ready pose turned towards the target.
+        seed: (n,) rad, posture to stay near; by default the ready pose turned towards the target.
         hand_direction: (3,) desired direction of the hand, base frame, any length; weighed against the rest of the
             posture. By default the seed's direction, or without a seed outwards and `hand_pitch` below horizontal.
 
     Returns:
-        (6,) joint angles, rad; continuous joints within π of the seed.
+        (n,) joint angles, rad; continuous joints within π of the seed.
 
     Raises:
         UnreachableError: No start arrived. The message says by how much the best one missed.
     """
-    settings, target = robot.tracking, np.asarray(target, dtype=float)
+    settings, target = robot.sized_tracking, np.asarray(target, dtype=float)
     azimuth = np.arctan2(target[0], -target[1])  # 0 ahead of the base
     ready = robot.home.copy()
-    ready[0] -= azimuth
+    ready[0] += np.round(robot.joint_rotations[0, 2, 2]) * azimuth  # whichever way the first joint's axis points
+    ready = robot.clip(ready)
     if seed is None:
         reference = ready
         direction = np.array([np.sin(azimuth), -np.cos(azimuth), -np.tan(settings.hand_pitch)])
@@ -83,7 +84,7 @@ def inverse_kinematics(
         direction, weight = np.asarray(hand_direction, dtype=float), settings.asked_direction_weight
     direction = direction / np.linalg.norm(direction)
 
-    scatter = np.random.default_rng(0).normal(scale=0.8, size=(settings.num_restarts, NUM_JOINTS))
+    scatter = np.random.default_rng(0).normal(scale=0.8, size=(settings.num_restarts, robot.num_joints))
     scatter[:2] = 0.0
     starts = np.where(np.arange(len(scatter))[:, None] % 2 == 0, reference, ready) + scatter
     posture = _posture(robot, reference[None], direction[None], weight)
@@ -98,12 +99,10 @@ def inverse_kinematics(
     chain = robot.chain(q.T)
     miss = np.linalg.norm(chain.position - target[:, None], axis=0)
     if miss.min() > settings.tolerance:
-        shoulder = robot.joint_translations[0] + robot.joint_rotations[0] @ robot.joint_translations[1]
-        shoulder = np.round(shoulder, 2) + 0.0  # the sum turns -0 into 0
         raise UnreachableError(
             f"no configuration reaches {np.round(target, 3).tolist()} m: the nearest misses by {miss.min():.3f} m. "
-            f"The arm reaches at most {robot.reach:.2f} m from its shoulder at {shoulder.tolist()} m; "
-            f"the target is {np.linalg.norm(target - shoulder):.2f} m from it."
+            f"The arm reaches at most {robot.reach:.2f} m from its shoulder at {robot.shoulder.tolist()} m; "
+            f"the target is {np.linalg.norm(target - robot.shoulder):.2f} m from it."
         )
     excess = q - np.clip(q, posture.soft_lower, posture.soft_upper)
     cost = ((q - reference) ** 2 + settings.limit_weight * excess**2).sum(axis=1) / 2  # h(q) of `track`
@@ -141,10 +140,10 @@ def track(
     Args:
         robot: the arm.
         path: (*B, T, 3) waypoints, metres, base frame. They need not be evenly spaced.
-        start: (*B, 6) configuration to start from, rad; usually reaches the first waypoint.
-        initial: (*B, T, 6) tracked joints of a nearby path, rad, from the same start: a warm start for live
+        start: (*B, n) configuration to start from, rad; usually reaches the first waypoint.
+        initial: (*B, T, n) tracked joints of a nearby path, rad, from the same start: a warm start for live
             dragging. If its joints jump, a cold start follows.
-        reference: (*B, 6) or (6,) configuration q_ref that the posture is measured from, rad; by default the start.
+        reference: (*B, n) or (n,) configuration q_ref that the posture is measured from, rad; by default the start.
 
     Returns:
         The joint path with its error and the interference of limits and singularities.
@@ -153,20 +152,20 @@ def track(
         ValueError: `start`, `initial` or `reference` do not fit the shape of `path`.
     """
     path, start = np.asarray(path, dtype=float), np.asarray(start, dtype=float)
-    if path.shape[-1] != 3 or start.shape != (*path.shape[:-2], NUM_JOINTS):
-        raise ValueError(f"path must be (*B, T, 3) and start (*B, 6), got {path.shape} and {start.shape}")
-    shape = (*path.shape[:-1], NUM_JOINTS)
-    paths, starts = path.reshape(-1, *path.shape[-2:]), robot.clip(start.reshape(-1, NUM_JOINTS))
+    if path.shape[-1] != 3 or start.shape != (*path.shape[:-2], robot.num_joints):
+        raise ValueError(f"path must be (*B, T, 3) and start (*B, n), got {path.shape} and {start.shape}")
+    shape = (*path.shape[:-1], robot.num_joints)
+    paths, starts = path.reshape(-1, *path.shape[-2:]), robot.clip(start.reshape(-1, robot.num_joints))
     references = starts if reference is None else _references(robot, reference, start.shape)
     posture = _posture(robot, references, robot.hand_direction(references), at_reference=True)
-    strides, each = [robot.tracking.stride, robot.tracking.stride / 4], np.arange(len(paths))
+    strides, each = [robot.sized_tracking.stride, robot.sized_tracking.stride / 4], np.arange(len(paths))
     if initial is None:
         guess = _walk(robot, paths, starts, posture, strides.pop(0))
     else:
         guess = np.asarray(initial, dtype=float)
         if guess.shape != shape:
             raise ValueError(f"initial must be {shape} like the path, got {guess.shape}")
-    q = _swept(robot, guess.reshape(*paths.shape[:2], NUM_JOINTS), paths, posture, each)
+    q = _swept(robot, guess.reshape(*paths.shape[:2], robot.num_joints), paths, posture, each)
     for stride in strides:
         lost = np.flatnonzero(loses_branch(robot, q, paths))
         if not len(lost):
@@ -181,30 +180,30 @@ def drawn_onto(robot: Robot, q: Array, positions: Array, reference: Array) -> Ar
 
     Args:
         robot: the arm.
-        q: (N, 6) postures a few millimetres off, rad.
+        q: (N, n) postures a few millimetres off, rad.
         positions: (N, 3) desired positions of the end effector, metres.
-        reference: (6,) as in `track`, rad.
+        reference: (n,) as in `track`, rad.
 
     Returns:
-        (N, 6) rad, inside the limits; for a position out of reach a posture near it.
+        (N, n) rad, inside the limits; for a position out of reach a posture near it.
     """
     posture = _posture(robot, reference[None], robot.hand_direction(reference)[None], at_reference=True)
     begin, targets = np.array(q, order="C"), np.array(positions, order="C")
     return settle(
-        robot.tracking_arm, posture, begin, targets, np.zeros(len(q), int), 0, robot.tracking.final_sweeps, -1.0
+        robot.tracking_arm, posture, begin, targets, np.zeros(len(q), int), 0, robot.sized_tracking.final_sweeps, -1.0
     )
 
 
 def _references(robot: Robot, reference: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """Return the reference configurations (B, 6), one for each start; `shape` is that of the starts, (*B, 6)."""
+    """Return the reference configurations (B, n), one for each start; `shape` is that of the starts, (*B, n)."""
     reference = np.asarray(reference, dtype=float)
     if reference.shape not in {shape, shape[-1:]}:
         raise ValueError(f"reference must be {shape} like the start, or one for all, got {reference.shape}")
-    return robot.clip(np.broadcast_to(reference, shape).reshape(-1, NUM_JOINTS))
+    return robot.clip(np.broadcast_to(reference, shape).reshape(-1, robot.num_joints))
 
 
 def _walk(robot: Robot, paths: Array, starts: Array, posture: Postures, stride: float) -> Array:
-    """Walk along paths (B, T, 3), all at once, one stride after the other; return rough joints (B, T, 6)."""
+    """Walk along paths (B, T, 3), all at once, one stride after the other; return rough joints (B, T, n)."""
     lines = np.concatenate([robot.end_effector(starts)[:, None], paths], axis=1)
     lengths = np.cumsum(np.linalg.norm(np.diff(lines, axis=1), axis=-1), axis=1)
     num_strides = 1 + int(lengths.max() / stride)
@@ -212,28 +211,28 @@ def _walk(robot: Robot, paths: Array, starts: Array, posture: Postures, stride: 
 
 
 def _swept(robot: Robot, q: Array, paths: Array, posture: Postures, which: NDArray[np.intp]) -> Array:
-    """Step all waypoints until none moves; q (B, T, 6), paths (B, T, 3), `which` (B,) of the postures they have."""
-    each, settings = np.repeat(which, paths.shape[1]), robot.tracking
-    begin, targets = np.array(q.reshape(-1, NUM_JOINTS), order="C"), np.array(paths.reshape(-1, 3), order="C")
+    """Step all waypoints until none moves; q (B, T, n), paths (B, T, 3), `which` (B,) of the postures they have."""
+    each, settings = np.repeat(which, paths.shape[1]), robot.sized_tracking
+    begin, targets = np.array(q.reshape(-1, robot.num_joints), order="C"), np.array(paths.reshape(-1, 3), order="C")
     limits = settings.max_sweeps, settings.final_sweeps, settings.step_tolerance
     return settle(robot.tracking_arm, posture, begin, targets, each, *limits).reshape(q.shape)
 
 
 def _report(robot: Robot, q: Array, path: Array) -> TrackedPath:
-    chain = robot.chain(q.reshape(-1, NUM_JOINTS).T)
+    chain = robot.chain(q.reshape(-1, robot.num_joints).T)
     manipulability = chain.manipulability().reshape(path.shape[:-1])
     return TrackedPath(
         q=q,
         error=np.linalg.norm(chain.position.T.reshape(path.shape) - path, axis=-1),
         limits_hit=np.any((q <= robot.lower) | (q >= robot.upper), axis=-1),
         manipulability=manipulability,
-        damped=manipulability < robot.tracking.singular_manipulability,
+        damped=manipulability < robot.sized_tracking.singular_manipulability,
     )
 
 
 def soft_limits(robot: Robot, reference: Array, *, at_reference: bool = True) -> tuple[Array, Array]:
-    """Find where the springs of references (*B, 6) start: `at_reference` not before these, which are optima then."""
-    margin = robot.tracking.limit_margin
+    """Find where the springs of references (*B, n) start: `at_reference` not before these, which are optima then."""
+    margin = robot.sized_tracking.limit_margin
     lower, upper = np.broadcast_arrays(robot.lower + margin, robot.upper - margin, reference)[:2]
     return (np.minimum(lower, reference), np.maximum(upper, reference)) if at_reference else (lower, upper)
 
@@ -241,15 +240,15 @@ def soft_limits(robot: Robot, reference: Array, *, at_reference: bool = True) ->
 def _posture(
     robot: Robot, reference: Array, direction: Array, weight: float | None = None, *, at_reference: bool = False
 ) -> Postures:
-    """Make the posture of references (B, 6); see `soft_limits`. None is the usual weight of the direction."""
-    weight = robot.tracking.direction_weight if weight is None else weight
+    """Make the posture of references (B, n); see `soft_limits`. None is the usual weight of the direction."""
+    weight = robot.sized_tracking.direction_weight if weight is None else weight
     soft_lower, soft_upper = soft_limits(robot, reference, at_reference=at_reference)
     arrays = reference, direction, soft_lower, soft_upper, np.full(len(reference), weight)
     return Postures(*(np.array(values, order="C") for values in arrays))
 
 
 def loses_branch(robot: Robot, q: Array, paths: Array) -> NDArray[np.bool_]:
-    """Find which (B,) joints (B, T, 6) jump by more than a continuous solution along paths (B, T, 3) can."""
+    """Find which (B,) joints (B, T, n) jump by more than a continuous solution along paths (B, T, 3) can."""
     moved = np.linalg.norm(np.diff(paths, axis=1), axis=-1)
-    allowed = 0.05 + robot.tracking.jump_per_root_metre * np.sqrt(moved)  # the constant is for repeated samples
+    allowed = 0.05 + robot.sized_tracking.jump_per_root_metre * np.sqrt(moved)  # the constant is for repeated samples
     return np.any(np.abs(np.diff(q, axis=1)) > allowed[..., None], axis=(1, 2))

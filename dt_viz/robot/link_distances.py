@@ -9,6 +9,7 @@ Lengths are metres, angles radians, positions in the robot's base frame.
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from functools import cached_property, lru_cache
@@ -20,7 +21,8 @@ import numpy as np
 
 from dt_viz.obstacles.shapes import Box, Cylinder, Obstacle, Sphere, rotation
 from dt_viz.obstacles.triangles import grid_nodes, inside_of_grid, surface_samples
-from dt_viz.robot.robot import LinkMesh, Robot
+from dt_viz.robot.kinematics import Kinematics
+from dt_viz.robot.meshes import LinkMesh
 
 if TYPE_CHECKING:
     from dt_viz.flows.fields import Array, Indices
@@ -47,14 +49,14 @@ BALL_SIZE = 0.06
 
 
 class Poses(NamedTuple):
-    """Frames of the base and the six joints, for N configurations; a link of joint j is at j + 1."""
+    """Frames of the base and the n joints, for N configurations; a link of joint j is at j + 1."""
 
-    rotations: Array  # (N, 7, 3, 3)
-    origins: Array  # (N, 7, 3), metres
+    rotations: Array  # (N, n + 1, 3, 3)
+    origins: Array  # (N, n + 1, 3), metres
 
     @classmethod
-    def of(cls, robot: Robot, q: Array) -> Poses:
-        """Compute the poses at configurations q (N, 6), rad."""
+    def of(cls, robot: Kinematics, q: Array) -> Poses:
+        """Compute the poses at configurations q (N, n), rad."""
         rotations, origins = robot.forward_kinematics(q)
         base = np.broadcast_to(np.eye(3), (len(q), 1, 3, 3))
         return cls(np.concatenate([base, rotations], axis=1), np.pad(origins, [(0, 0), (1, 0), (0, 0)]))
@@ -86,11 +88,27 @@ class _Groups(NamedTuple):
         return self.points[self.ends[group - 1] if group else 0 : self.ends[group]]
 
 
+def page_names(names: Sequence[str]) -> list[str]:
+    """Names of links on the page: those of the URDF without what all begin with, and without the word link.
+
+    A link that has a number alone is "link 1".
+    """
+    first, last = min(names), max(names)
+    num = next((k for k, pair in enumerate(zip(first, last, strict=False)) if pair[0] != pair[1]), len(first))
+    common, found = first[:num].rpartition("_")[0], []
+    for name in names:
+        words = re.sub(r"(?<![a-z])link_?|_?link$", "_", name.removeprefix(common)).split("_")
+        own = " ".join(filter(None, words))
+        found.append(f"link {own}".rstrip() if not own or own.isdecimal() else own)
+    return found
+
+
 class Link:
     """A link as a solid, in the frame of its joint.
 
     Attributes:
         name: name on the page.
+        urdf_name: name in the URDF.
         frame: index of its frame in `Poses`.
         surface: coal's model of the mesh.
         centre: (3,) centre of the box around the mesh, metres.
@@ -100,10 +118,8 @@ class Link:
         hull: (H, 3) vertices of the convex hull, metres.
     """
 
-    def __init__(self, mesh: LinkMesh) -> None:
-        self.name = mesh.name.split("_link_")[-1].replace("_", " ")
-        if self.name.isdecimal():
-            self.name = f"link {self.name}"
+    def __init__(self, mesh: LinkMesh, name: str) -> None:
+        self.name, self.urdf_name = name, mesh.name
         self.frame = mesh.joint + 1
         self._triangles = mesh.vertices[mesh.faces]  # (F, 3, 3)
         self._vertices = mesh.vertices
@@ -284,11 +300,15 @@ class BetweenLinks(Measure):
     tolerance = SELF_TOLERANCE
     lowest = 0.0
 
-    def __init__(self, links: Sequence[Link]) -> None:
-        # Neighbours touch by design; each other pair is apart in at least 96 % of random postures.
-        apart = [(a, b) for a, b in combinations(range(len(links)), 2) if links[b].frame - links[a].frame > 1]
+    def __init__(self, links: Sequence[Link], touching: frozenset[frozenset[str]]) -> None:
+        # Neighbours touch by design.
+        apart = [
+            (a, b)
+            for a, b in combinations(range(len(links)), 2)
+            if links[b].frame - links[a].frame > 1 and {links[a].urdf_name, links[b].urdf_name} not in touching
+        ]
         self._links = links
-        self._pairs = np.array(apart)
+        self._pairs = np.array(apart, dtype=np.intp).reshape(-1, 2)
         self._centres = np.array([link.centre for link in links])
         self._radii = np.array([link.radius for link in links])
         self._frames = np.array([link.frame for link in links])
@@ -319,13 +339,13 @@ class BetweenLinks(Measure):
 
 
 class AboveTable(_OfLinks):
-    """Heights of the links' lowest points above the table, on which the base and link 1 stand."""
+    """Heights of the links' lowest points above the table, on which the base and the first links stand."""
 
     tolerance = TOLERANCE
     lowest = -np.inf
 
-    def __init__(self, links: Sequence[Link]) -> None:
-        super().__init__(links, first_frame=2)
+    def __init__(self, links: Sequence[Link], num_fixed: int) -> None:
+        super().__init__(links, first_frame=num_fixed + 1)
 
     def _signed_distance(self, s: Array) -> Array:
         return s[..., 2]

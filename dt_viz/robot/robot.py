@@ -1,9 +1,4 @@
-"""The JACO arm: joint limits, kinematics, and the shapes of its links.
-
-Pinocchio reads the URDF once, into plain arrays; numpy computes everything else, for whole batches of configurations.
-Lengths are metres, angles radians, positions and directions in the robot's base frame. A configuration q is always six
-angles, also for the continuous joints, which pinocchio keeps as (cos, sin).
-"""
+"""An arm: its kinematics, limits, shapes, and what is known of it; the JACO."""
 
 from __future__ import annotations
 
@@ -11,203 +6,161 @@ from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
-from scipy.spatial.transform import Rotation
+import yourdfpy
 
-from dt_viz.kernels.arm import JOINT, chains, places
+from dt_viz.kernels.arm import BODY_POINT
+from dt_viz.kernels.blocks import MOST_JOINTS
+from dt_viz.kernels.proximity import least_contacts
 from dt_viz.kernels.tracking import TrackingArm
+from dt_viz.robot.body_points import BodyPoints
+from dt_viz.robot.collision import CollisionModel
+from dt_viz.robot.kinematics import Kinematics
+from dt_viz.robot.link_distances import page_names
+from dt_viz.robot.meshes import LinkMesh, VisualMesh
+from dt_viz.robot.sizing import sized
 from dt_viz.robot.tracking_settings import TrackingSettings
+from dt_viz.shipped import ASSETS
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
+    from collections.abc import Sequence
 
-    from dt_viz.flows.fields import Array
+    from numpy.typing import ArrayLike
 
-NUM_JOINTS = 6
+    from dt_viz.flows.fields import Array, Indices
+
 DISTRIBUTION = "example-robot-data"
 URDF_IN_DISTRIBUTION = "kinova_description/robots/kinova.urdf"
 END_EFFECTOR_FRAME = "j2s6s200_end_effector"
 
 HOME = (0.0, 3.2, 1.1, 0.0, 3.4, 0.0)
 """Ready pose, rad: upper arm upright, elbow high, hand ahead of the base (the JACO's front is -y), 47° downwards."""
-
-
-class KinematicChain(NamedTuple):
-    """Forward kinematics with the batch last, where a rotation costs one matrix product for the whole batch."""
-
-    axes: Array
-    """(6, 3, 3, N): [joint, column of the rotation, component], base frame."""
-    origins: Array
-    """(6, 3, N) of the joints, metres."""
-    position: Array
-    """(3, N) of the end effector, metres."""
-    direction: Array
-    """(3, N) unit vectors along the hand."""
-
-    def position_jacobian(self) -> Array:
-        """Compute the velocity of the end effector for each joint's, (6, 3, N), m/rad."""
-        return cross(self.axes[:, 2], self.position - self.origins)
-
-    def direction_jacobian(self) -> Array:
-        """Compute the velocity of the hand's direction for each joint's, (6, 3, N), per rad."""
-        return cross(self.axes[:, 2], self.direction)
-
-    def manipulability(self) -> Array:
-        """Compute the square root of det(J Jᵀ), J the position's Jacobian, (N,), m³."""
-        J = self.position_jacobian()
-        x, y, z = np.einsum("irn,isn->rsn", J, J)
-        return np.sqrt(np.maximum((x * cross(y, z)).sum(axis=0), 0.0))
+LEVERS = (0.5, 0.5, 0.35, 0.12, 0.14, 0.05)
+"""Levers of the JACO's joints, m/rad."""
+RING = (62, 66, 74)
+"""Colour of the JACO's rings."""
+LEAST_JOINTS = 3
+"""Smallest number of joints of an arm whose hand can be taken anywhere."""
 
 
 @dataclass(frozen=True, eq=False)
-class Robot:
-    """A serial arm of six revolute joints about their own z axes.
+class Robot(Kinematics):
+    """An arm of n joints, all that is known of it.
 
-    Attributes:
-        joint_names: Names of the six joints, base to hand.
-        lower: (6,) lower limits, rad; -inf for continuous joints.
-        upper: (6,) upper limits, rad; +inf for continuous joints.
-        velocity_limits: (6,) rad/s.
-        joint_rotations: (6, 3, 3) orientation of each joint in the previous one, at angle zero.
-        joint_translations: (6, 3) position of each joint in the previous one, metres.
-        link_rotations: (6, 3, 3) orientation of each joint at angle zero in its *parent link* in the URDF. It differs
-            from `joint_rotations` where fixed joints lie in between.
-        end_effector_offset: (3,) position of the end effector in the last joint, metres.
-        home: (6,) ready pose, rad.
-        tracking: settings of inverse kinematics and tracking.
+    Its frame is that of the arm's base, turned about z so that the arm's front is −y.
     """
 
+    name: str
+    """Short name, such as "jaco"."""
+    title: str
+    """Name on the page."""
     joint_names: tuple[str, ...]
+    """Names of the n joints, base to hand."""
     lower: Array
+    """(n,) lower limits, rad; −inf for continuous joints."""
     upper: Array
+    """(n,) upper limits, rad; +inf for continuous joints."""
     velocity_limits: Array
-    joint_rotations: Array
-    joint_translations: Array
-    link_rotations: Array
-    end_effector_offset: Array
+    """(n,) rad/s."""
     home: Array
+    """(n,) ready pose, rad."""
+    levers: Array
+    """(n,) motion of the hand for each joint's turning, m/rad, about: converts a distance of postures to a length."""
+    body: BodyPoints
+    """Body points of all links."""
+    meshes: tuple[LinkMesh, ...]
+    """Collision shapes of the links, from the base to the finger tips."""
+    visuals: tuple[VisualMesh, ...]
+    """What is drawn of the links."""
+    num_fixed: int
+    """Number of first joints whose links no motion moves away from an obstacle: that of a joint at the base only
+    spins."""
+    touching: frozenset[frozenset[str]]
+    """Pairs of links that may touch, besides neighbours, by name."""
+    base: Array
+    """(3, 3) rotation from the URDF's base to this frame."""
+    urdf: Path
+    """File that describes the arm."""
+    package_dirs: tuple[Path, ...]
+    """Folders in which the `package://` addresses of its meshes resolve."""
     tracking: TrackingSettings = field(default=TrackingSettings())
+    """Settings of inverse kinematics and tracking, their lengths for an arm as large as the JACO."""
 
-    @property
-    def reach(self) -> float:
-        """Length of the straightened arm from the second joint to the end effector, metres."""
-        segments = np.vstack([self.joint_translations[2:], self.end_effector_offset])
-        return float(np.linalg.norm(segments, axis=1).sum())
-
-    def clip(self, q: ArrayLike) -> Array:
-        """Return the nearest configuration inside the joint limits; q (*B, 6), rad."""
-        return np.clip(q, self.lower, self.upper)
-
-    # --- Kinematics ---
+    def __post_init__(self) -> None:
+        """Raise ValueError for fewer joints than the hand has coordinates, or more than compiled loops take."""
+        if not LEAST_JOINTS <= self.num_joints <= MOST_JOINTS:
+            accepted = f"{LEAST_JOINTS} to {MOST_JOINTS} between base and hand"
+            raise ValueError(f"{self.name}: found {self.num_joints} joints; accepted: {accepted}")
 
     @cached_property
-    def records(self) -> NDArray[np.void]:
-        """(6,) joints for compiled loops."""
-        joints = np.zeros(NUM_JOINTS, JOINT)
-        joints["rotation"], joints["translation"] = self.joint_rotations, self.joint_translations
-        return joints
+    def links(self) -> BodyPoints:
+        """Body points of the links that joints can move away from an obstacle."""
+        return self.body.of_joints(self.num_fixed)
+
+    @cached_property
+    def pedestal(self) -> BodyPoints:
+        """Body points of the base and the links that no motion moves away from anything."""
+        return self.body.of_joints(-1, self.num_fixed)
+
+    def link_name(self, joint: int) -> str:
+        """Name on the page of the link that moves with a joint; −1 is the base."""
+        names = page_names([mesh.name for mesh in self.meshes])
+        return next((name for name, mesh in zip(names, self.meshes, strict=True) if mesh.joint == joint), "base")
+
+    @cached_property
+    def collision(self) -> CollisionModel:
+        """The links as solids."""
+        return CollisionModel(self, self.meshes, self.num_fixed, self.touching)
+
+    @cached_property
+    def sized_tracking(self) -> TrackingSettings:
+        """These settings for this arm."""
+        return sized(self.tracking, self.size)
 
     @cached_property
     def tracking_arm(self) -> TrackingArm:
         """The arm for the compiled loops of tracking."""
-        hand, lower, upper = (np.array(values) for values in (self.end_effector_offset, self.lower, self.upper))
-        weights = (getattr(self.tracking, name) for name in TrackingArm._fields[4:])
-        return TrackingArm(self.records, hand, lower, upper, *weights)
+        arrays = (self.end_effector_offset, self.hand_axis, self.lower, self.upper)
+        hand, axis, lower, upper = (np.array(values) for values in arrays)
+        weights = (getattr(self.sized_tracking, name) for name in TrackingArm._fields[5:])
+        return TrackingArm(self.records, hand, axis, lower, upper, *weights)
 
-    def forward_kinematics(self, q: ArrayLike) -> tuple[Array, Array]:
-        """Compute the poses of the six joint frames (each turns with the link after it).
+    @property
+    def top_speed(self) -> float:
+        """Largest speed of any point, m/s, each joint at its limit: a fifth more than by levers, which are means."""
+        return float(1.2 * self.levers @ self.velocity_limits)
 
-        Args:
-            q: (*B, 6) joint angles, rad.
-
-        Returns:
-            Rotations (*B, 6, 3, 3) and origins (*B, 6, 3) in metres, both in the base frame.
-        """
-        q = np.asarray(q, dtype=float)
-        chain = self.chain(q.reshape(-1, NUM_JOINTS).T)
-        rotations = chain.axes.transpose(3, 0, 2, 1).reshape(*q.shape, 3, 3)
-        origins = chain.origins.transpose(2, 0, 1).reshape(*q.shape, 3)
-        return rotations, origins
-
-    def end_effector(self, q: ArrayLike) -> Array:
-        """Compute the end-effector positions (*B, 3), metres, of configurations q (*B, 6), rad."""
-        q = np.asarray(q, dtype=float)
-        return places(self.records, self.end_effector_offset, q.reshape(-1, NUM_JOINTS).copy()).reshape(
-            *q.shape[:-1], 3
-        )
-
-    def hand_direction(self, q: ArrayLike) -> Array:
-        """Compute unit vectors (*B, 3), base frame, from the last joint to the end effector; q (*B, 6), rad."""
-        q = np.asarray(q, dtype=float)
-        return self.chain(q.reshape(-1, NUM_JOINTS).T).direction.T.reshape(*q.shape[:-1], 3)
-
-    def jacobian(self, q: ArrayLike) -> Array:
-        """Compute the linear Jacobian of the end effector in the base frame.
+    def pairs(self, between: int) -> Indices:
+        """Pairs (K, 2) of body points, by their own spheres, that may not touch.
 
         Args:
-            q: (*B, 6) joint angles, rad.
-
-        Returns:
-            (*B, 3, 6), metres per rad: ẋ = J q̇.
+            between: smallest number of joints between them.
         """
-        q = np.asarray(q, dtype=float)
-        chain = self.chain(q.reshape(-1, NUM_JOINTS).T)
-        return chain.position_jacobian().transpose(2, 1, 0).reshape(*q.shape[:-1], 3, NUM_JOINTS)
+        points, joint_of = self.body, {mesh.name: mesh.joint for mesh in self.meshes}
+        may_touch = np.zeros((self.num_joints + 1, self.num_joints + 1), bool)  # the last one is the base, −1
+        for first, second in self.touching:
+            if first in joint_of and second in joint_of:
+                a, b = joint_of[first], joint_of[second]
+                may_touch[a, b] = may_touch[b, a] = True
+        apart = points.joint[:, None] + between <= points.joint
+        a, b = np.nonzero(apart & ~may_touch[points.joint[:, None], points.joint])
+        return points.indices[np.stack([a, b], axis=1)]
 
-    def joint_frames(self, q: ArrayLike) -> Array:
-        """Compute the rotation of each joint's child link in its parent link, for a viewer's scene tree.
+    def self_clearance(self, q: Array, enough: float) -> float:
+        """Compute the smallest distance, metres, of links that no joint connects at configurations q (N, n), rad.
 
-        The positions of these frames do not depend on q.
-
-        Args:
-            q: (*B, 6) joint angles, rad.
-
-        Returns:
-            (*B, 6, 4) unit quaternions, wxyz.
+        It is too small by twice `PROTRUSION` at most, and at most `enough`.
         """
-        q = np.asarray(q, dtype=float)
-        w, x, y, z = _quaternions(self.link_rotations).T
-        c, s = np.cos(q / 2), np.sin(q / 2)
-        # the fixed quaternion times (c, 0, 0, s), a turn about z
-        return np.stack([w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s], axis=-1)
+        pairs = self.pairs(between=2)
+        apart = least_contacts(self.records, self.body.spheres, pairs, np.array(q, order="C"), enough)
+        return float(apart.min(initial=enough))
 
-    def chain(self, q: Array) -> KinematicChain:
-        """Compute the forward kinematics of q (6, N), rad, with the batch last."""
-        axes, origins = chains(self.records, np.array(q.T, order="C"))
-        hand = (self.end_effector_offset @ axes[-1].reshape(3, -1)).reshape(3, -1)
-        return KinematicChain(axes, origins, origins[-1] + hand, hand / np.linalg.norm(self.end_effector_offset))
-
-
-@dataclass(frozen=True, eq=False)
-class LinkMesh:
-    """Collision shape of a link; the fingers, which do not move, are links of the last joint.
-
-    Attributes:
-        name: name of the link in the URDF.
-        joint: index of the joint that it moves with, -1 for the base.
-        vertices: (V, 3) metres, in the frame of that joint; of the base in the base frame.
-        faces: (F, 3) indices of vertices.
-    """
-
-    name: str
-    joint: int
-    vertices: Array
-    faces: NDArray[np.intp]
-
-
-def cross(a: Array, b: Array) -> Array:
-    """Compute cross products over the second last axis of a (*B, 3, N) and b (*B, 3, N)."""
-    ax, ay, az = a[..., 0, :], a[..., 1, :], a[..., 2, :]
-    bx, by, bz = b[..., 0, :], b[..., 1, :], b[..., 2, :]
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-2)
-
-
-def _quaternions(rotations: Array) -> Array:
-    """Convert rotations (N, 3, 3) to unit quaternions (N, 4), wxyz."""
-    return np.roll(Rotation.from_matrix(rotations).as_quat(), 1, axis=-1)
+    def clip(self, q: ArrayLike) -> Array:
+        """Return the nearest configuration inside the joint limits; q (*B, n), rad."""
+        return np.clip(q, self.lower, self.upper)
 
 
 def urdf_path() -> Path:
@@ -229,16 +182,6 @@ def urdf_path() -> Path:
     raise FileNotFoundError(f"{DISTRIBUTION} {distribution.version} holds no {URDF_IN_DISTRIBUTION}; 6.0.0 does")
 
 
-def package_folder() -> Path:
-    """Return the folder in which the `package://` addresses of the URDF's meshes resolve.
-
-    Raises:
-        FileNotFoundError: As `urdf_path`.
-    """
-    path = urdf_path()
-    return next(folder.parent for folder in path.parents if folder.name == DISTRIBUTION)
-
-
 @lru_cache(maxsize=1)
 def load_jaco() -> Robot:
     """Load the JACO arm (j2s6s200: six joints, two fingers), once.
@@ -246,41 +189,54 @@ def load_jaco() -> Robot:
     Raises:
         FileNotFoundError: As `urdf_path`.
     """
-    model = pin.buildModelFromUrdf(str(urdf_path()))  # pyright: ignore[reportAttributeAccessIssue]  # it has no stubs
-    joints = range(1, NUM_JOINTS + 1)  # 0 is pinocchio's universe
-    hand = model.frames[model.getFrameId(END_EFFECTOR_FRAME)].placement
-    lower, upper, in_link = np.full(NUM_JOINTS, -np.inf), np.full(NUM_JOINTS, np.inf), []
+    urdf = urdf_path()
+    package_dir = next(folder.parent for folder in urdf.parents if folder.name == DISTRIBUTION)
+    model = pin.buildModelFromUrdf(str(urdf))  # pyright: ignore[reportAttributeAccessIssue]  # it has no stubs
+    joints = range(1, model.njoints)  # 0 is pinocchio's universe
+    hand = _constant(model.frames[model.getFrameId(END_EFFECTOR_FRAME)].placement.translation)
+    lower, upper = np.full(len(joints), -np.inf), np.full(len(joints), np.inf)
     for i in joints:
         if model.joints[i].nq == 1:  # the continuous joints' limits bound (cos, sin), not the angle
             lower[i - 1] = model.lowerPositionLimit[model.joints[i].idx_q]
             upper[i - 1] = model.upperPositionLimit[model.joints[i].idx_q]
-        frame = model.frames[model.getFrameId(model.names[i])]
-        in_link.append(model.frames[frame.parentFrame].placement.actInv(model.jointPlacements[i]))
+    joint_names = tuple(model.names)[1:]
     return Robot(
-        joint_names=tuple(model.names)[1:],
+        name="jaco",
+        title="JACO",
+        joint_names=joint_names,
         lower=_constant(lower),
         upper=_constant(upper),
         velocity_limits=_constant(model.velocityLimit),
         joint_rotations=_constant([model.jointPlacements[i].rotation for i in joints]),
         joint_translations=_constant([model.jointPlacements[i].translation for i in joints]),
-        link_rotations=_constant([placement.rotation for placement in in_link]),
-        end_effector_offset=_constant(hand.translation),
+        end_effector_offset=hand,
+        hand_axis=hand,
         home=_constant(HOME),
+        levers=_constant(LEVERS),
+        body=_body_points(),
+        meshes=_collision_meshes(model, urdf, package_dir),
+        visuals=_visuals(joint_names, urdf, package_dir),
+        num_fixed=1,
+        touching=frozenset(),
+        base=_constant(np.eye(3)),
+        urdf=urdf,
+        package_dirs=(package_dir,),
     )
 
 
-@lru_cache(maxsize=1)
-def collision_meshes() -> tuple[LinkMesh, ...]:
-    """Load the collision meshes of the URDF, from the base to the finger tips, once.
+def _body_points() -> BodyPoints:
+    """The JACO's body points, made by ``python -m assets.make_body_points``."""
+    with np.load(ASSETS / "body_points.npz", allow_pickle=False) as data:
+        spheres = np.zeros(len(data["joint"]), BODY_POINT)
+        for name in BODY_POINT.names or ():
+            spheres[name] = data[name]
+    return BodyPoints(spheres)
 
-    Raises:
-        FileNotFoundError: As `urdf_path`.
-    """
-    path = str(urdf_path())
-    model = pin.buildModelFromUrdf(path)  # pyright: ignore[reportAttributeAccessIssue]  # it has no stubs
+
+def _collision_meshes(model: Any, urdf: Path, package_dir: Path) -> tuple[LinkMesh, ...]:  # noqa: ANN401 - no stubs
     kind = pin.GeometryType.COLLISION  # pyright: ignore[reportAttributeAccessIssue]
     shapes = pin.buildGeomFromUrdf(  # pyright: ignore[reportAttributeAccessIssue]
-        model, path, kind, package_dirs=[str(package_folder())]
+        model, str(urdf), kind, package_dirs=[str(package_dir)]
     )
     meshes = []
     for shape in shapes.geometryObjects:
@@ -296,6 +252,27 @@ def collision_meshes() -> tuple[LinkMesh, ...]:
                 faces=faces,
             )
         )
+    return tuple(meshes)
+
+
+def _visuals(joint_names: Sequence[str], urdf: Path, package_dir: Path) -> tuple[VisualMesh, ...]:
+    """The meshes that are drawn, of the base, of the links, and of what is fixed to them; rings are dark."""
+    model = yourdfpy.URDF.load(
+        str(urdf), filename_handler=lambda fname: str(fname).replace("package://", f"{package_dir}/")
+    )
+    scene = model.scene
+    assert scene is not None
+    frames = [scene.graph.base_frame, *(model.joint_map[name].child for name in joint_names)]
+    parents, meshes = scene.graph.transforms.parents, []
+    for name, mesh in scene.geometry.items():
+        link = parents[name]
+        while link not in frames:
+            link = parents[link]
+        place, faces = model.get_transform(name, link), np.array(mesh.faces, dtype=np.intp)
+        faces.flags.writeable = False
+        vertices = _constant(mesh.vertices @ place[:3, :3].T + place[:3, 3])
+        colour = RING if name.startswith("ring") else None
+        meshes.append(VisualMesh(name, frames.index(link) - 1, vertices, faces, colour))
     return tuple(meshes)
 
 

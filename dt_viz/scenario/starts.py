@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dt_viz.flows.fields import Array
+from dt_viz.flows.fields import Array, Mask
 from dt_viz.obstacles.shapes import as_point
 from dt_viz.scenario.scenario import MAX_STARTS, Scenario, Start
 from dt_viz.scenario.slices import Slice
@@ -18,10 +18,6 @@ INNER = 0.8
 """Part of the slice that a grid covers."""
 APART = 0.02
 """Smallest distance between starts, metres."""
-SHOULDER = (0.0, 0.0, 0.28)
-"""Place of the arm's shoulder, metres."""
-REACH = 0.95
-"""Largest distance of a start from the shoulder, metres."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +61,9 @@ def with_moved_start(scenario: Scenario, index: int, place: Array) -> tuple[Star
     return _changed(scenario, index, place=as_point(place))
 
 
-def with_grid(scenario: Scenario, area: Slice, arm_room: Callable[[Array], Array]) -> Grid:
+def with_grid(
+    scenario: Scenario, area: Slice, arm_room: Callable[[Array], Array], reached: Callable[[Array], Mask]
+) -> Grid:
     """Return the scenario's starts with a grid over the slice, without places where no motion can begin.
 
     Args:
@@ -73,6 +71,7 @@ def with_grid(scenario: Scenario, area: Slice, arm_room: Callable[[Array], Array
         area: the slice.
         arm_room: distance (N,) of the arm from the obstacles with its hand at places (N, 3), metres; asked where the
             whole arm avoids them.
+        reached: which (N,) of such places are within the arm's reach.
     """
     u, v = (np.linspace(-INNER * half, INNER * half, num) for half, num in zip(area.half_size, (4, 4), strict=True))
     places = area.at(np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2))
@@ -80,7 +79,7 @@ def with_grid(scenario: Scenario, area: Slice, arm_room: Callable[[Array], Array
     if scenario.arm_avoidance is not None:
         rooms = np.minimum(rooms, arm_room(places))
     blocked = rooms < scenario.avoidance.margin
-    far = ~blocked & ((places[:, 2] < 0.02) | (np.linalg.norm(places - np.array(SHOULDER), axis=1) > REACH))
+    far = ~blocked & ((places[:, 2] < 0.02) | (~reached(places)))
     for place in places[~blocked & ~far]:
         scenario = replace(scenario, starts=with_start(scenario, place))
     return Grid(scenario.starts, int(blocked.sum()), int(far.sum()))

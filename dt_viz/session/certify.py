@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from dt_viz.avoidance.arm_field import LEVERS
 from dt_viz.metrics import maximum_collision_distance
 from dt_viz.motion.certificates import (
     MAX_OFF_POSTURE,
@@ -27,7 +26,7 @@ from dt_viz.motion.diagnostics import (
 from dt_viz.motion.following import Follower
 from dt_viz.motion.solve import Solved
 from dt_viz.obstacles.union import Union
-from dt_viz.robot.collision import load_collision_model
+from dt_viz.robot.robot import Robot
 from dt_viz.scenario.stack import WHOLE_ARM
 from dt_viz.session.frame import Frame
 from dt_viz.warning import Kind
@@ -36,7 +35,8 @@ from dt_viz.warning import Kind
 def uncertified(motion: Solved, drawn: DrawnSamples, follower: Follower) -> Certificates:
     """What is known of a motion at once: its clearance, and what it does not get that it wants."""
     kept = motion.arm.clearance if motion.arm else clearance(motion, drawn, motion.scenario.obstacle, follower)
-    found = (*motion_warnings(motion, drawn), *anchor_warnings(motion.stack), *target_warnings(motion, drawn))
+    found = motion_warnings(motion, drawn, follower.robot)
+    found += (*anchor_warnings(motion.stack, follower.robot), *target_warnings(motion, drawn))
     return Certificates(kept, found=found)
 
 
@@ -59,19 +59,20 @@ def certify(frame: Frame, follower: Follower) -> Certificates:
     if frame.arm is not None:
         p[arm.index == frame.chosen] = frame.arm.q
     known = known.warning(*fold_warnings(WHOLE_ARM, arm.transform, integration, p, undisturbed))
+    levers = follower.robot.levers
     known, q = certified_map(
-        known, arm.transform, p, undisturbed, NUM_POSTURES, MAX_OFF_POSTURE, LEVERS, by_hand=integration.by_hand
+        known, arm.transform, p, undisturbed, NUM_POSTURES, MAX_OFF_POSTURE, levers, by_hand=integration.by_hand
     )
     below = replace(drawn, positions=follower.robot.end_effector(undisturbed if integration.by_hand else q))
     return certified(known, motion.stack, below, tolerance=MAX_OFF_TRACKED)
 
 
-def with_meshes(frame: Frame) -> Certificates:
-    """Certificates with distances of the arm's meshes: on the motion that it shows, and on all that it avoids along."""
+def with_meshes(frame: Frame, robot: Robot) -> Certificates:
+    """Certificates with distances of an arm's meshes: on the motion that it shows, and on all that it avoids along."""
     known, motion = frame.certificates, frame.motion
     if frame.arm is None:
         return known
-    model, scenario, avoidance = load_collision_model(), motion.scenario, motion.scenario.arm_avoidance
+    model, scenario, avoidance = robot.collision, motion.scenario, motion.scenario.arm_avoidance
     report = model.report(frame.arm.q, scenario.obstacle)
     # what gives way only in part may still be in the obstacle
     apart = {Kind.ARM_ENTERS} if scenario.warp < 1 else set()

@@ -17,7 +17,6 @@ from dt_viz.motion.following import ArmMotion, Follower, arm_samples
 from dt_viz.motion.nominal import Learned
 from dt_viz.motion.profiles import NUM_SAMPLES
 from dt_viz.obstacles.union import Union
-from dt_viz.robot.collision import load_collision_model
 from dt_viz.robot.inverse_kinematics import UnreachableError, track
 from dt_viz.robot.retiming import within_velocity_limits
 from dt_viz.scenario.tasks import Task
@@ -169,7 +168,7 @@ class Comparison:
         return ArmMotion(within_velocity_limits(times, q, self._follower.robot.velocity_limits), q, q)
 
     def _joints(self, known: Compared, learned: Learned, rollout: int) -> Array:
-        """Postures (N, 6), rad, along a rollout: planned, or tracking it from the demonstration's first posture."""
+        """Postures (N, n), rad, along a rollout: planned, or tracking it from the demonstration's first posture."""
         if known.joints is not None:
             return known.joints[rollout]
         path = known.paths[rollout]
@@ -178,7 +177,7 @@ class Comparison:
 
     def _arm_depth(self, known: Compared, frame: Frame, learned: Learned, cancelled: Cancelled) -> float | None:
         """How deep the arm's meshes enter the obstacle along motions, metres; None where it cannot follow."""
-        model, depth, ours = load_collision_model(), 0.0, known.method is OURS
+        model, depth, ours = self._follower.robot.collision, 0.0, known.method is OURS
         try:
             moving = np.flatnonzero(frame.motion.nominal.moving).tolist()
             for k in moving if ours else range(len(known.paths)):

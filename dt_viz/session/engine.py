@@ -255,7 +255,7 @@ class Engine:
         with _cores.slot(cancelled):
             known = certify(frame, self.follower)
         with _cores.slot(cancelled):
-            return with_meshes(replace(frame, certificates=known))
+            return with_meshes(replace(frame, certificates=known), self.follower.robot)
 
     def _compared(self, frame: Frame, notes: Mapping[str, str] | None = None) -> Frame:
         """The frame with other methods beside ours, as far as they are known; `notes` see `Comparison.of`."""

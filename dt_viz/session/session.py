@@ -13,6 +13,7 @@ from typing import Any
 from dt_viz.avoidance.passing import ANEW
 from dt_viz.errors import DataError, UnwantedError
 from dt_viz.learning.imitation import ImitationError
+from dt_viz.robot.robot import Robot
 from dt_viz.scenario.paper_scenes import SCENES
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import IMITATION, as_fresh
@@ -72,6 +73,11 @@ class Session:
         """All work of the visitor beside the server's event loop."""
         self._adopt()
         self._submit()
+
+    @property
+    def robot(self) -> Robot:
+        """The arm."""
+        return self._engine.follower.robot
 
     @property
     def task(self) -> Task:

@@ -15,7 +15,7 @@ import viser
 from dt_viz.learning.store import FitStore
 from dt_viz.memo import Memo
 from dt_viz.obstacles.files import MAX_BYTES
-from dt_viz.robot.robot import load_jaco
+from dt_viz.robot.robot import Robot
 from dt_viz.scenario.tasks import TaskEntry
 from dt_viz.session.engine import Engine
 from dt_viz.ui.gate import Gate, Limits
@@ -42,6 +42,7 @@ class Server:
         self,
         tasks: Mapping[str, TaskEntry],
         fits: FitStore,
+        robot: Robot,
         *,
         task: str,
         host: str = "127.0.0.1",
@@ -55,6 +56,7 @@ class Server:
         Args:
             tasks: tasks by name.
             fits: store shared by all visitors.
+            robot: the arm.
             task: first task of each visitor.
             host: address to listen on.
             port: port to listen on; 0 takes any free one.
@@ -67,7 +69,7 @@ class Server:
             GateError: this version of viser is not supported.
         """
         port = _checked_port(host, port)
-        robot, titles, shared = load_jaco(), {name: entry.title for name, entry in tasks.items()}, Memo()
+        titles, shared = {name: entry.title for name, entry in tasks.items()}, Memo()
         self._new_visitor: Callable[[viser.ClientHandle], Visitor] = lambda client: Visitor(
             client, Engine(tasks, fits, robot, shared), robot, titles, task
         )

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scenes import changed
 
-from dt_viz.avoidance.arm import OPPOSED, WholeArm
-from dt_viz.avoidance.arm_field import LEVERS
-from dt_viz.avoidance.arm_solver import COARSE_SPACING, MAX_DURATION, ROUNDING, ArmSolution
+from dt_viz.avoidance.arm import WholeArm
+from dt_viz.avoidance.arm_settings import WholeArmSettings
+from dt_viz.avoidance.arm_solver import MAX_DURATION, ROUNDING, ArmSolution
 from dt_viz.avoidance.lift import Lift
 from dt_viz.flows.diffeomorphisms import Identity
 from dt_viz.metrics import resample_by_arc_length, sharpest_turn
@@ -16,8 +16,8 @@ from dt_viz.motion.following import Follower
 from dt_viz.motion.stack import FINE, LIVE
 from dt_viz.obstacles.shapes import Box, Sphere, as_point
 from dt_viz.robot.body_points import PROTRUSION
-from dt_viz.robot.collision import load_collision_model
 from dt_viz.robot.inverse_kinematics import track
+from dt_viz.robot.robot import load_jaco
 from dt_viz.scenario.scenario import Scenario
 
 ELBOW = Sphere((0.04, -0.37, 0.38), 0.08)
@@ -49,7 +49,7 @@ class Case:
         """Distance of the meshes from the obstacle on motions, between their samples, too."""
         if isinstance(motions, ArmSolution):
             motions = split(motions, motions.p)
-        model = load_collision_model()
+        model = load_jaco().collision
         return min(model.nearest_to_obstacle(q, obstacle).distance for q in motions)
 
     def beside(self, clearance, diameter=0.1) -> Sphere:
@@ -131,9 +131,9 @@ class TestAroundTheMiddle:
 
     def test_neighbouring_samples_are_near(self, case, coarse):
         solution = case.avoiding(coarse=coarse)
-        spacing = COARSE_SPACING if coarse else FINE.spacing
+        spacing = WholeArmSettings().coarse_spacing if coarse else FINE.spacing
         for p, fraction in zip(split(solution, solution.p), split(solution, solution.fraction), strict=True):
-            assert np.linalg.norm(np.diff(p * LEVERS, axis=0), axis=1).max() <= spacing
+            assert np.linalg.norm(np.diff(p * case.robot.levers, axis=0), axis=1).max() <= spacing
             assert (np.diff(fraction) > 0).all() and fraction[0] == 0 and fraction[-1] == 1
             hand = case.robot.end_effector(p)
             assert np.linalg.norm(np.diff(hand, axis=0), axis=1).max() < 2 * spacing
@@ -252,7 +252,7 @@ def test_a_posture_that_is_pinned_beside_a_limit_or_beyond_it_is_put_inside_and_
     """The arm begins and ends just above a lower limit."""
     joint, lower = 2, push.robot.lower.copy()
     lower[joint] = push.lifted.pins[:, joint].min() - 0.01
-    arm = WholeArm(replace(push.robot, lower=lower), push.follower.body)
+    arm = WholeArm(replace(push.robot, lower=lower))
     avoidance = replace(push.scenario.arm_avoidance, temperature=temperature, duration=0.4 if temperature > 6 else None)
     solution = arm.avoiding(push.lifted, avoidance, LIVE.spacing, coarse=True)
     np.testing.assert_allclose(solution.p[ends(solution)], solution.q[ends(solution)], rtol=0, atol=1e-6)
@@ -294,7 +294,7 @@ class TestTwoObstacles:
 
     def test_opposed_ways_out_of_what_one_posture_meets_become_one(self, push, pair):
         one, other = (self.first(push, ball)[0] for ball in pair)
-        assert one @ other < OPPOSED
+        assert one @ other < WholeArmSettings().opposed
         solution = push.avoiding(pair, coarse=True)
         first, second = solution.detours
         np.testing.assert_array_equal(first.side, second.side)
@@ -305,7 +305,7 @@ class TestTwoObstacles:
     def test_ways_out_that_are_alike_or_that_no_posture_meets_both_of_stay_as_they_are(self, push, pair, monkeypatch):
         x, y, z = pair[0].position
         for other, together in ((replace(pair[0], position=(x, y, z + 0.001)), 0.05), (pair[1], -1.0)):
-            monkeypatch.setattr("dt_viz.avoidance.arm.TOGETHER", together)
+            monkeypatch.setattr(push.arm, "settings", WholeArmSettings(together=together))
             alone = [self.first(push, ball)[0] for ball in (pair[0], other)]
             np.testing.assert_array_equal(self.first(push, pair[0], other), alone)
 

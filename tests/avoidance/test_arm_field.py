@@ -24,10 +24,10 @@ from laws.registry import (
 )
 from oracles import central_differences
 
-from dt_viz.avoidance.arm_field import CORE, GradientField, WholeArmField
+from dt_viz.avoidance.arm_field import GradientField, WholeArmField
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Flow
 from dt_viz.obstacles.shapes import Box, Sphere
-from dt_viz.robot.robot import HOME, NUM_JOINTS
+from dt_viz.robot.robot import HOME
 
 seeds = st.integers(0, 2**32 - 1)
 ESCAPES = {name: field for name, field in ARM_FIELDS.items() if isinstance(field, WholeArmField)}
@@ -51,7 +51,7 @@ def clearance(field, q):
 def occupancy(field, points, depth):
     """How far body points (*B, P, 3) are in an obstacle: 0 out of the field's reach, 1 at its core."""
     distance = field.obstacles[0].signed_distance(points) - field.body.radius
-    u = np.clip((field.reach - distance) / (field.reach + CORE * (depth + field.body.radius)), 0, 1)
+    u = np.clip((field.reach - distance) / (field.reach + field.settings.core * (depth + field.body.radius)), 0, 1)
     return 6 * u**5 - 15 * u**4 + 10 * u**3
 
 
@@ -121,7 +121,7 @@ class TestGradientField:
         return GradientField(ROBOT, BODY, (request.param,), REACH)
 
     def potential(self, field, q):
-        depth = field.reach + CORE * (field.obstacles[0].depth + BODY.radius)
+        depth = field.reach + field.settings.core * (field.obstacles[0].depth + BODY.radius)
         return (depth * occupancy(field, BODY.positions(ROBOT, q), field.obstacles[0].depth)).sum(axis=-1)
 
     def test_it_is_the_gradient_of_the_summed_occupancy(self, gradient):
@@ -134,7 +134,7 @@ class TestGradientField:
 class TestJointLimits:
     @given(seeds, st.sampled_from([1e-3, 0.1, 1.0, 10.0, 1e3]))
     def test_everything_lands_strictly_inside_the_limits(self, seed, spread):
-        s = np.array(HOME) + np.random.default_rng(seed).normal(scale=spread, size=(50, NUM_JOINTS))
+        s = np.array(HOME) + np.random.default_rng(seed).normal(scale=spread, size=(50, ROBOT.num_joints))
         q = LIMITS.inverse(s)
         assert (q > ROBOT.lower).all() and (q < ROBOT.upper).all()
 
@@ -145,7 +145,7 @@ class TestJointLimits:
         away, near = beyond < 0, beyond > LIMITS.zone / 2  # farther from it the difference may be lost in rounding
         for image, J in (LIMITS.jacobian(q), LIMITS.inverse_jacobian(q)):
             np.testing.assert_array_equal(image[away], q[away])
-            np.testing.assert_array_equal(J[away], np.broadcast_to(np.eye(NUM_JOINTS), J.shape)[away])
+            np.testing.assert_array_equal(J[away], np.broadcast_to(np.eye(ROBOT.num_joints), J.shape)[away])
             assert (image[near] != q[near]).all()
 
     @given(seeds)

@@ -8,10 +8,9 @@ from dt_viz.baselines.linear import Linear
 from dt_viz.baselines.postures import PlanningScene, Query, planned
 from dt_viz.obstacles.shapes import Box, Sphere, as_point
 from dt_viz.obstacles.union import Union
-from dt_viz.robot.collision import load_collision_model
 from dt_viz.robot.inverse_kinematics import UnreachableError
 from dt_viz.robot.link_distances import Poses
-from dt_viz.robot.robot import collision_meshes
+from dt_viz.robot.robot import load_jaco
 
 
 def test_joints_go_straight_from_the_demonstrated_start_to_the_demonstrated_goal(problem):
@@ -71,7 +70,7 @@ class TestSurroundings:
         """Smallest distance of some vertices of the meshes from the obstacle and the table, at some samples."""
         line = start + np.linspace(0, 1, 25)[:, None] * (end - start)
         poses, least = Poses.of(robot, line), np.inf
-        for mesh in collision_meshes():
+        for mesh in load_jaco().meshes:
             frame = mesh.joint + 1
             points = mesh.vertices[::7] @ poses.rotations[:, frame].transpose(0, 2, 1) + poses.origins[:, frame, None]
             least = min(least, obstacle.signed_distance(points).min())
@@ -92,7 +91,7 @@ class TestSurroundings:
         assert 3 < sum(verdicts) < 27
 
     def test_what_is_far_from_everything_is_free(self, problem, lines):
-        model = load_collision_model()
+        model = load_jaco().collision
         far, nothing = (PlanningScene.of(problem.robot, Union(parts)) for parts in ((Sphere((5.0, 0.0, 0.0)),), ()))
         for line in lines[:15]:
             itself = model.nearest_to_itself(np.stack(line))
@@ -103,7 +102,7 @@ class TestSurroundings:
     def test_nothing_between_two_samples_is_passed_through(self, problem, lines):
         free = [line for line in lines if PlanningScene.of(problem.robot, Union()).is_free(*line)]
         assert len(free) > 10
-        rng, mesh = np.random.default_rng(2), collision_meshes()[-1]
+        rng, mesh = np.random.default_rng(2), load_jaco().meshes[-1]
         for start, end in free[:15]:
             poses = Poses.of(problem.robot, (start + rng.uniform() * (end - start))[None])
             vertex = mesh.vertices[rng.integers(len(mesh.vertices))]
@@ -112,7 +111,7 @@ class TestSurroundings:
             assert not PlanningScene.of(problem.robot, speck).is_free(start, end)
 
     def test_the_arm_may_not_pass_through_itself_or_the_table(self, problem):
-        nothing, model, rng = PlanningScene.of(problem.robot, Union()), load_collision_model(), np.random.default_rng(1)
+        nothing, model, rng = PlanningScene.of(problem.robot, Union()), load_jaco().collision, np.random.default_rng(1)
         seen = set()
         for q in problem.robot.clip(rng.uniform(-np.pi, np.pi, size=(40, 6)) + problem.robot.home):
             report = model.report(q[None], Union())

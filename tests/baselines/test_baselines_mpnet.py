@@ -8,6 +8,7 @@ from typing import cast
 
 import numpy as np
 import pytest
+from other_arms import OTHER_ARMS
 from plans import joints_of
 
 from dt_viz.baselines.base import NotFittedError
@@ -24,7 +25,7 @@ from dt_viz.baselines.postures import PlanningScene
 from dt_viz.errors import UnwantedError
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
-from dt_viz.robot.collision import load_collision_model
+from dt_viz.robot.robot import load_jaco
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.shipped import ASSETS
 
@@ -34,7 +35,7 @@ needs_ompl = pytest.mark.skipif(find_spec("ompl") is None, reason="ompl is an ex
 def weights(seed=0):
     """Some weights, as training leaves them."""
     rng = np.random.default_rng(seed)
-    return {**initial(ARCHITECTURE.widths, rng), "centre": rng.normal(size=6), "scale": rng.uniform(0.1, 1, size=6)}
+    return {**initial(ARCHITECTURE.widths(6), rng), "centre": rng.normal(size=6), "scale": rng.uniform(0.1, 1, size=6)}
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +49,7 @@ def search(free):
     """A search on a line: postures differ in their first joint only, and `free` decides of two of its values."""
 
     line = SimpleNamespace(robot=SimpleNamespace(clip=np.asarray), is_free=lambda start, end: free(start[0], end[0]))
-    model = MPNetModel.of(weights())
+    model = MPNetModel.of(weights(), 6)
     return Search(model, cast(PlanningScene, line), np.random.default_rng(0))
 
 
@@ -58,7 +59,7 @@ def at(*values):
 
 class TestModel:
     def test_dropout_leaves_out_the_asked_share_and_is_seeded(self):
-        model = MPNetModel.of(weights())
+        model = MPNetModel.of(weights(), 6)
         (first, again), other = (
             (model.next(np.zeros(6), np.ones(6), np.random.default_rng(0)) for _ in range(2)),
             (model.next(np.zeros(6), np.ones(6), np.random.default_rng(1))),
@@ -75,9 +76,15 @@ class TestModel:
     def test_weights_that_lack_something_are_refused_by_name(self, name):
         arrays = weights()
         with pytest.raises(NotFittedError, match=f"{name}.*nothing"):
-            MPNetModel.of({key: value for key, value in arrays.items() if key != name})
+            MPNetModel.of({key: value for key, value in arrays.items() if key != name}, 6)
         with pytest.raises(NotFittedError, match=f"{name}.*found"):
-            MPNetModel.of({**arrays, name: arrays[name][:-1]})
+            MPNetModel.of({**arrays, name: arrays[name][:-1]}, 6)
+
+    @pytest.mark.parametrize("method", [MPNet(), MPNetRRT()], ids=lambda method: method.name)
+    @pytest.mark.parametrize("arm", OTHER_ARMS)
+    def test_for_another_arm_it_says_whose_weights_they_are(self, problem, method, arm):
+        with pytest.raises(NotFittedError, match=r"^trained for the JACO only$"):
+            method.fit(replace(problem, robot=OTHER_ARMS[arm]()))
 
     def test_all_weights_that_ship_take_a_megabyte(self):
         files = list((ASSETS / "baselines").glob("*.npz"))
@@ -127,7 +134,7 @@ class TestPlanning:
         first, second = (MPNet().fit(problem).plan(in_the_way, problem.task.starts[:1]) for _ in range(2))
         (q,) = joints_of(first)
         np.testing.assert_array_equal(q, joints_of(second)[0])
-        assert load_collision_model().nearest_to_obstacle(q, in_the_way).distance < 0  # its encoder knows of none
+        assert load_jaco().collision.nearest_to_obstacle(q, in_the_way).distance < 0  # its encoder knows of none
         assert first.warnings
         np.testing.assert_array_equal(q[[0, -1]], problem.postures[0][[0, -1]])
         assert len(q) > 200  # it did not stay with the straight line
@@ -140,7 +147,7 @@ class TestRRT:
         first, second = (planner.plan(in_the_way, problem.task.starts[:1]) for _ in range(2))
         (q,) = joints_of(first)
         np.testing.assert_array_equal(q, joints_of(second)[0])
-        report = load_collision_model().report(q, in_the_way)
+        report = load_jaco().collision.report(q, in_the_way)
         assert report.obstacle.distance > 0 and report.table.distance > 0
         assert report.itself is None or report.itself.distance > 0
         assert not first.warnings
@@ -150,7 +157,7 @@ class TestRRT:
     @needs_ompl
     def test_what_there_is_no_time_for_stays_in_collision_and_says_so(self, problem, in_the_way):
         plan = MPNetRRT(seconds=0.0).fit(problem).plan(in_the_way, problem.task.starts[:1])
-        assert load_collision_model().nearest_to_obstacle(joints_of(plan)[0], in_the_way).distance < 0
+        assert load_jaco().collision.nearest_to_obstacle(joints_of(plan)[0], in_the_way).distance < 0
         assert "start 1 collides" in plan.warnings[0]
 
     @needs_ompl
@@ -200,7 +207,7 @@ class TestTraining:
 
     def test_what_training_returns_can_be_planned_with(self, problem):
         lines = []
-        model = MPNetModel.of(train(problem, 100, lines.append))
+        model = MPNetModel.of(train(problem, 100, lines.append), 6)
         assert len(lines) == 1
         q, goal = problem.postures[0][[0, -1]]
         rng = np.random.default_rng(0)

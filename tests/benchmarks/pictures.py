@@ -22,6 +22,7 @@ from dt_viz.control.controller import Phase
 from dt_viz.evaluate.options import InputError, add_lasa
 from dt_viz.folders import default_cache_folder
 from dt_viz.learning.store import FitStore
+from dt_viz.robot.robot import load_jaco
 from dt_viz.scenario.paper_scenes import SCENES, offered
 from dt_viz.scenario.tasks import known_tasks
 from dt_viz.session.frame import Stage
@@ -62,7 +63,7 @@ def run(options: argparse.Namespace) -> int:
     width, height = options.size
     complaints: list[str] = []
     with sync_playwright() as playwright:
-        server = Server(tasks, FitStore(default_cache_folder()), task="draw_s", port=0)
+        server = Server(tasks, FitStore(default_cache_folder()), load_jaco(), task="draw_s", port=0)
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
         try:
             for name in options.only or scenes:

@@ -8,8 +8,8 @@ from dt_viz.ui.server import Server
 
 
 @pytest.fixture(scope="module")
-def server(fits):
-    server = Server(TASKS, fits, task="draw_s", port=0, max_sessions=2)
+def server(fits, robot):
+    server = Server(TASKS, fits, robot, task="draw_s", port=0, max_sessions=2)
     yield server
     server.close()
 

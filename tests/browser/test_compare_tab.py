@@ -43,8 +43,8 @@ INK = """() => [...document.querySelectorAll('.uplot canvas')].map(canvas => {
 
 
 @pytest.fixture(scope="module")
-def server(fits):
-    server = Server(TASKS, fits, task="push_box", port=0)
+def server(fits, robot):
+    server = Server(TASKS, fits, robot, task="push_box", port=0)
     yield server
     server.close()
 

@@ -7,13 +7,13 @@ from scenes import changed
 
 from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.control.controller import ArmController, Phase
-from dt_viz.control.limits import FASTEST, ContactLimit
+from dt_viz.control.limits import ContactLimit
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.kernels.proximity import contacts, least_contacts
 from dt_viz.motion.stack import LIVE
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
-from dt_viz.robot.collision import load_collision_model
+from dt_viz.robot.robot import load_jaco
 
 TICK, LATE = 0.01, 0.5
 SETTINGS = ControllerSettings()
@@ -129,7 +129,7 @@ def test_two_spheres_that_close_in_from_both_sides(live):
 def test_a_robot_that_is_pushed_down_does_not_go_into_the_table(engine, initial, task):
     live = Robot(engine, initial, task)
     live.run(1.0)
-    model, lowest, said = load_collision_model(), np.inf, set()
+    model, lowest, said = load_jaco().collision, np.inf, set()
     height = min(0.0, model.nearest_to_table(live.q[None]).distance)
     for _ in range(4):
         live.controller.hold(live.hand - [0, 0, 0.4])
@@ -144,7 +144,7 @@ def test_a_robot_that_is_pushed_down_does_not_go_into_the_table(engine, initial,
 
 
 def test_a_robot_that_is_folded_does_not_touch_itself(live):
-    rng, model, closest, said = np.random.default_rng(1), load_collision_model(), np.inf, set()
+    rng, model, closest, said = np.random.default_rng(1), load_jaco().collision, np.inf, set()
     live.run(1.0)
     for _ in range(12):
         live.controller.hold(np.array([0.0, 0.0, 0.35]) + rng.normal(scale=0.1, size=3))
@@ -157,19 +157,19 @@ def test_a_robot_that_is_folded_does_not_touch_itself(live):
 
 
 def test_links_come_near_the_table_and_each_other_no_faster_than_is_reckoned_with(live):
-    body, postures = live.follower.body, np.random.default_rng(0).uniform(-np.pi, np.pi, (300, 6))
+    body, postures = live.robot.body, np.random.default_rng(0).uniform(-np.pi, np.pi, (300, 6))
     for make in (ContactLimit.table, ContactLimit.itself):
-        pairs = make(live.robot, body, 5e-3, 20.0).pairs
+        pairs = make(live.robot, 5e-3, 20.0).pairs
         found = [contacts(live.robot.records, body.spheres, pairs, q, 9.0) for q in postures]
         _, apart, slopes = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        assert (np.abs(slopes[apart > 0]) @ live.robot.velocity_limits).max() < FASTEST
+        assert (np.abs(slopes[apart > 0]) @ live.robot.velocity_limits).max() < live.robot.top_speed
 
 
 def test_distances_of_contacts_have_these_slopes(live):
-    body, rng, joints, reach = live.follower.body, np.random.default_rng(0), live.robot.records, 0.3
+    body, rng, joints, reach = live.robot.body, np.random.default_rng(0), live.robot.records, 0.3
     whole, small = body.spheres, cover(body)
     owner = np.searchsorted(body.indices, np.flatnonzero(whole["end"] == np.arange(len(whole)) + 1), side="right") - 1
-    for limit in (ContactLimit.table(live.robot, body, 5e-3, 20.0), ContactLimit.itself(live.robot, body, 5e-3, 20.0)):
+    for limit in (ContactLimit.table(live.robot, 5e-3, 20.0), ContactLimit.itself(live.robot, 5e-3, 20.0)):
         q = live.q + rng.normal(scale=0.3, size=6)
 
         def exact(q, limit=limit):

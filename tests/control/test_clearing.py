@@ -5,8 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dt_viz.avoidance.arm import BESIDE
-from dt_viz.avoidance.arm_field import LEVERS
 from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.control.clearing import Clearing, clearing
 from dt_viz.flows.fields import Array
@@ -61,7 +59,7 @@ def test_the_transform_is_a_bijection(arm, q):
     found, p = made(arm, q, around(arm, q[50]))
     assert np.abs(p - q).max() > 0.1
     there_and_back = found.transform(arm, found.duration).forward(p)
-    assert np.linalg.norm((there_and_back - q) * LEVERS, axis=1).max() < 3e-3
+    assert np.linalg.norm((there_and_back - q) * arm.robot.levers, axis=1).max() < 3e-3
 
 
 def test_nothing_near_or_nothing_to_avoid_changes_nothing(arm, q):
@@ -75,7 +73,7 @@ def test_a_margin_wider_than_all_that_is_looked_at_turns_to_a_way_out(arm, q):
     """That of an obstacle that is fast and still far away."""
     avoidance = around(arm, q[50], (0, -0.5, 0.0))
     away = arm.clearance(q, avoidance.avoided).min()
-    assert away > BESIDE
+    assert away > arm.settings.beside
     up = np.array([0.0, 0.0, 1.0])
     found, _ = made(arm, q, replace(avoidance, margin=away + 0.05), chosen(up), 0.1, np.array([[0.0, 3.0, 0.0]]))
     assert way_out(found) @ up > np.cos(0.11)

@@ -12,7 +12,7 @@ from dt_viz.control.settings import ControllerSettings
 from dt_viz.flows.diffeomorphisms import Identity
 from dt_viz.motion.stack import LIVE
 from dt_viz.obstacles.shapes import Sphere, as_point
-from dt_viz.robot.collision import load_collision_model
+from dt_viz.robot.robot import load_jaco
 
 TICK = 0.01
 MARGIN = 0.03
@@ -144,7 +144,7 @@ class TestArrival:
         solved = scene.around(scene.middle)
         robot = Robot(scene.controller(solved), scene.start).run(20, until=Phase.RESTING)
         assert scene.missed(robot.q) < 1e-3
-        near = load_collision_model().nearest_to_obstacle(np.array(robot.passed)[::5], solved.scenario.obstacle)
+        near = load_jaco().collision.nearest_to_obstacle(np.array(robot.passed)[::5], solved.scenario.obstacle)
         assert near.distance > 0.8 * MARGIN
 
     def test_and_then_home_and_back(self, scene):
@@ -191,7 +191,7 @@ class TestDisturbances:
 
     def test_at_rest_it_steps_aside_and_comes_back(self, scene):
         robot = Robot(scene.controller(), scene.start).run(12, until=Phase.RESTING)
-        model, closest = load_collision_model(), np.inf
+        model, closest = load_jaco().collision, np.inf
         hand = scene.robot.end_effector(robot.q)
         for distance in np.linspace(0.25, 0.03, 100):  # 7 cm/s
             solved = scene.around(hand + distance * np.array([0.0, -0.6, 0.8]))
@@ -254,7 +254,7 @@ class TestDisturbances:
             """The arm, staying near another posture."""
 
             robot, whole_arm = scene.engine.follower.robot, scene.engine.follower.whole_arm
-            body = scene.engine.follower.body
+            body = scene.engine.follower.robot.body
 
             def reference(self, nominal):
                 return scene.engine.follower.reference(nominal) + offset

@@ -30,7 +30,7 @@ def _barrier(arm):
 
 def distances(arm: WholeArm, q, seen, moved=0.0):
     """Distances h of the spheres that cover moving links, for all pairs, after the parts have moved for a time."""
-    body, parts = cover(arm.links), seen.avoidance.avoided.parts
+    body, parts = cover(arm.robot.links), seen.avoidance.avoided.parts
     points, moving = body.positions(arm.robot, q), zip(parts, moved * seen.velocities, strict=True)
     distances = [part.signed_distance(points - shift) - body.radius for part, shift in moving]
     return np.concatenate(distances) - min(KEPT, seen.avoidance.margin / 2)
@@ -41,7 +41,7 @@ def scenes(arm: WholeArm, num):
     rng = np.random.default_rng(5)
     for k in range(num):
         q = arm.robot.home + rng.normal(scale=0.5, size=6)
-        points = arm.links.positions(arm.robot, q)
+        points = arm.robot.links.positions(arm.robot, q)
         shapes = []
         for _ in range(1 + k % 2):
             way = rng.normal(size=3)

@@ -12,7 +12,7 @@ from dt_viz.evaluate.around import TURN_ARC, Place, Rollout, _shares
 from dt_viz.metrics import distance_from_path, sharpest_turn
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.obstacles.union import Union
-from dt_viz.robot.collision import load_collision_model
+from dt_viz.robot.robot import load_jaco
 from dt_viz.scenario.tasks import lasa_tasks
 from dt_viz.warning import ARM, Kind, MotionWarning
 
@@ -41,7 +41,7 @@ def split(written_and_printed):
 
 def test_angles_end_effector_and_demonstration_belong_together_and_the_figures_are_theirs(around, middle, robot):
     arrays, rows, figures = around(middle)
-    model, ball = load_collision_model(), Sphere(tuple(middle), 0.1)
+    model, ball = load_jaco().collision, Sphere(tuple(middle), 0.1)
     for i in range(NUM_DEMONSTRATIONS):
         q, x, demo = arrays[f"q_{i}"], arrays[f"x_{i}"], arrays[f"demo_{i}"]
         assert q.shape == (len(x), 6) and len(arrays[f"times_{i}"]) == len(q) and x.shape[1] == demo.shape[1] == 3

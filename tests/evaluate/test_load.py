@@ -26,9 +26,9 @@ def patient(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def url(fits):
+def url(fits, robot):
     """Address of a server in this process."""
-    server = Server(TASKS, fits, task="draw_s", port=0, max_sessions=NUM_VISITORS)
+    server = Server(TASKS, fits, robot, task="draw_s", port=0, max_sessions=NUM_VISITORS)
     yield f"ws://127.0.0.1:{server.port}"
     server.close()
 

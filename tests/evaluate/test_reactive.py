@@ -9,7 +9,7 @@ import pytest
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.evaluate import reactive
 from dt_viz.obstacles.shapes import Sphere, as_point
-from dt_viz.robot.collision import load_collision_model
+from dt_viz.robot.robot import load_jaco
 
 
 def test_reactive_writes_what_its_figures_are_computed_from_and_repeats(measured, robot):
@@ -32,7 +32,7 @@ def test_reactive_writes_what_its_figures_are_computed_from_and_repeats(measured
 
 def nearest(q, places, diameter):
     """Smallest distance of the arm's meshes from a sphere at one of its places for each posture."""
-    model = load_collision_model()
+    model = load_jaco().collision
     return min(
         model.obstacle_distance(joints[None], Sphere(as_point(place), diameter))[0][0]
         for joints, place in zip(q, places, strict=True)
@@ -78,7 +78,7 @@ def test_a_second_obstacle_and_a_turned_box_count(engine):
     parts = boxes.obstacles(crossing, t)
     assert len(parts) == 2 and parts[0].wxyz == crossing.passages[0].wxyz != parts[1].wxyz
     np.testing.assert_allclose([part.position for part in parts], crossing.at(t))
-    q, model = boxes.starts[:1], load_collision_model()
+    q, model = boxes.starts[:1], load_jaco().collision
     run = reactive.Run(q=[q[0]], obstacle=[crossing.at(t)])
     expected = min(float(model.obstacle_distance(q, part)[0][0]) for part in parts)
     assert reactive.smallest_distance(boxes, run, crossing) == pytest.approx(expected, abs=1e-9)

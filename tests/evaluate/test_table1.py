@@ -16,7 +16,7 @@ from dt_viz.evaluate.options import InputError
 from dt_viz.metrics import discrete_frechet, resample_by_arc_length
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.obstacles.union import Union
-from dt_viz.robot.collision import load_collision_model
+from dt_viz.robot.robot import load_jaco
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import TASKS
 
@@ -58,7 +58,7 @@ def test_cells_are_those_of_the_arrays_beside_them(folder, table, method):
             x, q = arrays[f"x_{k}_{i}"], arrays[f"q_{k}_{i}"]
             dense = [resample_by_arc_length(path, 1500) for path in (x, arrays[f"demo_{i}"])]
             rows["frechet"].append(float(discrete_frechet(*dense)))
-            distances, _ = load_collision_model().obstacle_distance(q, ball)
+            distances, _ = load_jaco().collision.obstacle_distance(q, ball)
             rows["clearance"].append(distances.min())
             rows["arm_depth"].append(max(0, -distances.min()))
             rows["hand_depth"].append(max(0, -ball.signed_distance(resample_by_arc_length(x, 1500)).min()))
@@ -112,7 +112,7 @@ def test_places_collide_with_each_motion_and_leave_the_ends_free(problem, monkey
     for place in places:
         for path in problem.learned.demonstrated.paths:
             assert place.obstacle.signed_distance(path).min() < 0
-        distances, _ = load_collision_model().obstacle_distance(ends, place.sphere)
+        distances, _ = load_jaco().collision.obstacle_distance(ends, place.sphere)
         assert distances.min() > 0
         away = np.linalg.norm(place.perturbed[:, None] - problem.task.starts, axis=2).min(axis=1)
         assert (away <= table1.SETTINGS.perturbed_by).all()
@@ -153,7 +153,7 @@ def test_paths_of_the_hand_are_tracked_by_the_arm(problem):
 def test_a_motion_that_stays_at_its_start_is_measured(problem):
     x, q = problem.task.paths[0][:1], problem.postures[0][:1]
     nowhere = Union((Sphere((5.0, 0.0, 0.0), 0.15),))
-    found = table1.measure(x, np.zeros(1), q, problem.task.paths[0], problem.learned.goal, nowhere)
+    found = table1.measure(problem.robot, x, np.zeros(1), q, problem.task.paths[0], problem.learned.goal, nowhere)
     assert found.frechet == pytest.approx(np.linalg.norm(problem.task.paths[0] - x, axis=1).max(), rel=1e-4)
     assert found.goal_error == pytest.approx(np.linalg.norm(problem.learned.goal - x[0]))
     assert found.hand_depth == found.turn == found.jerk == 0

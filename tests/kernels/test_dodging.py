@@ -8,11 +8,10 @@ from body_spheres import cover
 
 from dt_viz.kernels.dodging import ENOUGH, Forecast, LimitedArm, dodge
 from dt_viz.obstacles.shapes import Box, Sphere, as_point, records
-from dt_viz.robot.body_points import load_body_points
 from dt_viz.robot.robot import load_jaco
 
 ROBOT = load_jaco()
-LINKS = load_body_points().on_moving_links
+LINKS = load_jaco().links
 COVER = cover(LINKS)
 FLOOR, DEPTH, KEPT = 0.05, 0.02, 0.01
 UP = np.array([0.0, 0.0, 1.0])

@@ -47,8 +47,7 @@ from dt_viz.obstacles.shapes import (
     as_point,
 )
 from dt_viz.obstacles.solids import Solid
-from dt_viz.robot.body_points import load_body_points
-from dt_viz.robot.robot import HOME, NUM_JOINTS, load_jaco
+from dt_viz.robot.robot import HOME, load_jaco
 from dt_viz.scenario.tasks import DRAWING_AXES
 
 Points = Callable[[int], np.ndarray]
@@ -152,7 +151,7 @@ def bump(dim: int) -> Flow:
 # --- the arm ---
 
 ROBOT = load_jaco()
-BODY = load_body_points().on_moving_links
+BODY = load_jaco().links
 READY = np.array(HOME)
 LIMITS = JointLimits(ROBOT.lower, ROBOT.upper)
 LIMITED = np.isfinite(ROBOT.lower)
@@ -170,13 +169,13 @@ HAND, ELBOW = beside_hand(0.02, 0.03, -0.01), Sphere((0.0, -0.05, 0.6), 0.12)
 
 def near_ready(num: int, spread: float = 0.15, seed: int = 0) -> np.ndarray:
     """Postures around the ready one, (num, 6) rad."""
-    return READY + np.random.default_rng(seed).normal(scale=spread, size=(num, NUM_JOINTS))
+    return READY + np.random.default_rng(seed).normal(scale=spread, size=(num, ROBOT.num_joints))
 
 
 def beside_limits(num: int, closest: float = 0.012, seed: int = 0) -> np.ndarray:
     """Postures anywhere inside the limits, many of them near one."""
     rng = np.random.default_rng(seed)
-    q, lower, upper = rng.uniform(-7, 7, (num, NUM_JOINTS)), ROBOT.lower[LIMITED], ROBOT.upper[LIMITED]
+    q, lower, upper = rng.uniform(-7, 7, (num, ROBOT.num_joints)), ROBOT.lower[LIMITED], ROBOT.upper[LIMITED]
     margin = closest + rng.uniform(0, 2 * LIMITS.zone, (num, LIMITED.sum()))
     anywhere = rng.uniform(lower + closest, upper - closest, (num, LIMITED.sum()))
     q[:, LIMITED] = np.choose(rng.integers(0, 3, (num, LIMITED.sum())), [lower + margin, upper - margin, anywhere])

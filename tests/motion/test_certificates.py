@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scenes import changed, frame_at, kinds
 
-from dt_viz.avoidance.arm_field import LEVERS
 from dt_viz.flows.diffeomorphisms import Diffeomorphism, Flow, Identity
 from dt_viz.flows.fields import Array, GaussianGrid, GridRBF
 from dt_viz.flows.integrators import EULER, IMPLICIT_EULER
@@ -267,7 +266,7 @@ def of_elbow(postures, robot):
     """Turns of the joints (6,) that move an elbow of the middle posture by 5 mm, by their levers, and not the hand."""
     middle = postures[[len(postures) // 2]]
     null = np.linalg.svd(robot.chain(middle.T).position_jacobian()[..., 0].T)[2][-1]
-    return 5e-3 * null / np.linalg.norm(null * LEVERS)
+    return 5e-3 * null / np.linalg.norm(null * robot.levers)
 
 
 def displaced(path, rows, offset):
@@ -309,12 +308,12 @@ def test_postures_of_another_motion_are_recognised(arm, robot, corruption):
     assert Kind.OFF_MOTION in arm.failed(arm.with_postures(lambda p, q: ARM[corruption](p, q, robot)))
 
 
-def test_tolerances_are_far_from_what_the_computation_leaves_and_from_5_mm_where_space_is_squeezed_most(hand, arm):
+def test_tolerances_are_far_from_what_is_left_and_from_5_mm_where_space_is_squeezed_most(hand, arm, robot):
     of_hand, of_arm = hand.frame.motion.stack, arm.frame.motion.arm
     hand_base = of_hand.rays.at(of_hand.bundle.index, of_hand.bundle.fraction)
     for transform, y, base, units, tolerance in (
         (of_hand.transform, of_hand.bundle.positions, hand_base, np.ones(3), MAX_OFF),
-        (of_arm.transform, of_arm.p, of_arm.q, LEVERS, MAX_OFF_POSTURE),
+        (of_arm.transform, of_arm.p, of_arm.q, robot.levers, MAX_OFF_POSTURE),
     ):
         left = np.linalg.norm((transform.forward(y) - base) * units, axis=1).max()
         stretches = np.linalg.svd(units[:, None] * transform.jacobian(y[::20])[1] / units, compute_uv=False)

@@ -11,10 +11,13 @@ from dt_viz.avoidance.hand import BESIDE, Avoidance
 from dt_viz.motion.diagnostics import MARGIN_TOLERANCE, MAX_GOAL_MISS, margin_warnings
 from dt_viz.motion.stack import FINE
 from dt_viz.obstacles.shapes import Sphere, as_point
-from dt_viz.robot.body_points import BodyPoints, load_body_points
-from dt_viz.robot.collision import Nearest, load_collision_model
+from dt_viz.robot.body_points import BodyPoints
+from dt_viz.robot.collision import Nearest
+from dt_viz.robot.robot import load_jaco
 from dt_viz.scenario.scenario import Layer, Scenario, View
 from dt_viz.scenario.stack import plane_of
+from dt_viz.scenario.tasks import TASKS
+from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Stage
 from dt_viz.warning import ARM, Kind, MotionWarning, told
 
@@ -165,15 +168,15 @@ def test_a_margin_that_the_meshes_do_not_keep_is_said_with_what_they_keep():
 
 
 @pytest.mark.parametrize("kept", [pytest.param(True, marks=pytest.mark.slow), False])
-def test_the_last_frame_says_what_margin_the_meshes_keep(engine, new_engine, initial, monkeypatch, kept):
+def test_the_last_frame_says_what_margin_the_meshes_keep(engine, fits, robot, initial, kept):
     if not kept:  # spheres that do not cover the arm
-        spheres = load_body_points().spheres.copy()
+        spheres = robot.body.spheres.copy()
         spheres["radius"] -= 0.012
-        monkeypatch.setattr("dt_viz.motion.following.load_body_points", lambda: BodyPoints(spheres))
-        engine = new_engine()
+        engine = Engine(TASKS, fits, replace(robot, body=BodyPoints(spheres)))
     margin, scenario = 0.01, changed(initial("draw_s"), space="cspace", margin=0.01, view=View(field=False))
     frame = stage(engine, scenario, Stage.CERTIFIED)
-    model, arm = load_collision_model(), engine.solved(scenario, FINE).arm
+    model, arm = load_jaco().collision, engine.solved(scenario, FINE).arm
+    assert arm is not None
     clearance = [
         model.nearest_to_obstacle(arm.p[arm.index == k], scenario.obstacle).distance for k in range(len(frame.rollouts))
     ]

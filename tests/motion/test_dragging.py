@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scenes import changed, frame_at
 
-from dt_viz.avoidance.arm import DURATION_CHANGE
+from dt_viz.avoidance.arm_settings import WholeArmSettings
 from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.avoidance.detour import DETOUR, escape_directions
 from dt_viz.avoidance.passing import ANEW
@@ -249,7 +249,7 @@ def test_motions_change_no_faster_than_the_obstacle_moves(new_engine, initial, s
         assert not frame.blocked
         arm = engine.solved(scenario, LIVE).arm
         if before is not None and engine.solved(scenario, LIVE).nominal.posture == posture:
-            assert abs(arm.duration - before.duration) <= 1.001e-3 * DURATION_CHANGE
+            assert abs(arm.duration - before.duration) <= 1.001e-3 * WholeArmSettings().duration_change
             for way, last in zip(arm.detours, before.detours, strict=True):
                 if way is not None and last is not None:
                     assert way.direction @ last.direction > np.cos(1.1 * DETOUR.turning * 1e-3 / ball.radius)

@@ -17,8 +17,9 @@ from dt_viz.motion.solve import solve
 from dt_viz.motion.stack import FINE, LIVE, build_stack
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.obstacles.union import Union
-from dt_viz.robot.collision import SELF_MARGIN, load_collision_model
+from dt_viz.robot.collision import SELF_MARGIN
 from dt_viz.robot.inverse_kinematics import UnreachableError
+from dt_viz.robot.robot import load_jaco
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.engine import Engine
@@ -97,7 +98,7 @@ class TestAdmission:
     def test_what_fits_between_the_fingers_covers_the_goal_only_where_it_is_there(self, follower, nominal, robot):
         """The end effector is a point of the arm, too: its way may not begin or end in an obstacle."""
         ball, pins = around(nominal.goal, 0.02), follower.undisturbed(nominal).pins
-        assert load_collision_model().obstacle_distance(pins[-1:], ball)[0][0] > 0  # the fingers are beside it
+        assert load_jaco().collision.obstacle_distance(pins[-1:], ball)[0][0] > 0  # the fingers are beside it
         (reason,) = self.reasons(follower, nominal, ball)
         assert reason.kind is Kind.GOAL_COVERED
         across = np.cross(robot.hand_direction(pins[-1]), [0.0, 1.0, 0.0])
@@ -106,7 +107,7 @@ class TestAdmission:
 
     def test_a_start_between_the_fingers_is_left_out(self, follower, nominal):
         ball = around(nominal.task.starts[2], 0.02)
-        assert load_collision_model().obstacle_distance(follower.undisturbed(nominal).pins[2:3], ball)[0][0] > 0
+        assert load_jaco().collision.obstacle_distance(follower.undisturbed(nominal).pins[2:3], ball)[0][0] > 0
         assert self.admission(follower, nominal, ball).nominal.status[2] is StartStatus.IN_COLLISION
 
     def test_demonstrations_out_of_reach_are_named(self, too_far, initial, robot):
@@ -133,7 +134,7 @@ class TestReferencePosture:
     def truth(self, q, avoidance):
         """Distance of the meshes from the obstacle at each posture."""
         (part,) = avoidance.avoided.parts
-        return load_collision_model().obstacle_distance(q, part)[0]
+        return load_jaco().collision.obstacle_distance(q, part)[0]
 
     def test_the_arm_rests_elsewhere_with_the_hand_where_it_was_and_can_be_taken_there(self, follower, beside, robot):
         nominal, avoidance = beside
@@ -148,7 +149,7 @@ class TestReferencePosture:
         assert lifted.tracked.error.max() < MAX_TRACKING_ERROR
         assert not lifted.tracked.limits_hit.any() and not lifted.tracked.damped.any()
         assert (lifted.tracked.q > robot.lower).all() and (lifted.tracked.q < robot.upper).all()
-        itself = load_collision_model().nearest_to_itself(lifted.tracked.q[0])
+        itself = load_jaco().collision.nearest_to_itself(lifted.tracked.q[0])
         assert itself is None or itself.distance >= SELF_MARGIN
         # by one section from every start
         q = lifted.tracked.q[:, ::20]
@@ -156,7 +157,7 @@ class TestReferencePosture:
         np.testing.assert_allclose(again, q, rtol=0, atol=1e-3)
 
     def test_the_meshes_keep_clear_of_each_other_with_all_reference_postures(self, follower, beside):
-        known, model = follower.reference_postures(beside[0].learned), load_collision_model()
+        known, model = follower.reference_postures(beside[0].learned), load_jaco().collision
         for posture in range(0, len(known.references), 20):
             near = [model.nearest_to_itself(q) for q in (known.on_path[posture], *known.at_starts[posture][:, None])]
             assert all(nearest is None or nearest.distance >= SELF_MARGIN for nearest in near)

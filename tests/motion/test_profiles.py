@@ -17,7 +17,7 @@ from dt_viz.metrics import (
 )
 from dt_viz.motion import profiles as profiles_module
 from dt_viz.motion.profiles import NUM_SAMPLES
-from dt_viz.robot.body_points import load_body_points
+from dt_viz.robot.robot import load_jaco
 from dt_viz.scenario.scenario import View
 from dt_viz.session.frame import Stage
 from dt_viz.ui.tabs.plots import HealthPlots
@@ -82,7 +82,7 @@ def test_clearance_agrees_with_the_signed_distance(shown, robot):
     assert profiles.shown.clearance.min() == pytest.approx(frame.certificates.clearance, abs=0.03)
     assert profiles.undisturbed.depth > 0.03 and profiles.shown.depth < 1e-3
     if profiles.of_body:
-        points, q = cover(load_body_points().on_moving_links), frame.arm.q[[0]]
+        points, q = cover(load_jaco().links), frame.arm.q[[0]]
         first = (obstacle.signed_distance(points.positions(robot, q[0])) - points.radius).min()
         assert profiles.shown.clearance[0] == pytest.approx(first, abs=1e-9)
         return

@@ -78,7 +78,8 @@ def test_a_bias_and_the_demonstrated_rollouts_are_those_without_added_starts(eng
 
 def test_the_whole_arm_makes_way_for_the_task_and_names_the_added_starts_that_it_does_not_suit(engine, initial):
     scenario = changed(initial("draw_s"), space="cspace")
-    grid = with_grid(changed(scenario, space="task"), engine.task("draw_s").slice, lambda places: np.zeros(len(places)))
+    area, reaches = engine.task("draw_s").slice, engine.follower.robot.reaches
+    grid = with_grid(changed(scenario, space="task"), area, lambda places: np.zeros(len(places)), reaches)
     alone, frame = (frame_at(engine, replace(scenario, starts=starts), Stage.LIVE) for starts in ((), grid.starts))
     assert frame.arm_duration == pytest.approx(alone.arm_duration, rel=1e-3)
     assert frame.certificates.clearance == pytest.approx(alone.certificates.clearance, abs=1e-4)

@@ -12,23 +12,24 @@ from pinocchio_arm import random_configurations
 from scipy.spatial import KDTree
 
 from dt_viz.obstacles.shapes import Sphere
-from dt_viz.robot.body_points import PROTRUSION, BodyPoints, load_body_points
-from dt_viz.robot.collision import SELF_REACH, load_collision_model
+from dt_viz.robot.body_points import PROTRUSION, BodyPoints
+from dt_viz.robot.collision import SELF_REACH
 from dt_viz.robot.link_distances import SELF_TOLERANCE
-from dt_viz.robot.robot import LinkMesh, collision_meshes
+from dt_viz.robot.meshes import LinkMesh
+from dt_viz.robot.robot import load_jaco
 from dt_viz.shipped import ASSETS
 
 SCRIPT = Path(__file__).parents[2] / "assets" / "make_body_points.py"
 JOINTS = range(-1, 6)
 MEAN_PROTRUSION = 3.5e-3
 
-each_link = pytest.mark.parametrize("mesh", collision_meshes(), ids=lambda mesh: mesh.name)
+each_link = pytest.mark.parametrize("mesh", load_jaco().meshes, ids=lambda mesh: mesh.name)
 each_joint = pytest.mark.parametrize("joint", JOINTS)
 
 
 @pytest.fixture(scope="module")
 def body() -> BodyPoints:
-    return load_body_points()
+    return load_jaco().body
 
 
 def on_surface(mesh: LinkMesh, num: int = 50_000) -> np.ndarray:
@@ -45,7 +46,7 @@ def on_surface(mesh: LinkMesh, num: int = 50_000) -> np.ndarray:
 def surface_of_joints() -> dict[int, KDTree]:
     """Points less than a millimetre apart on all the links that move with a joint."""
     return {
-        joint: KDTree(np.concatenate([on_surface(mesh) for mesh in collision_meshes() if mesh.joint == joint]))
+        joint: KDTree(np.concatenate([on_surface(mesh) for mesh in load_jaco().meshes if mesh.joint == joint]))
         for joint in JOINTS
     }
 
@@ -151,7 +152,7 @@ class TestPositions:
 
     def test_pedestal_and_moving_links_are_all_there_is_and_the_end_effector_is_one_more(self, body, robot):
         q, more = random_configurations(robot, 1, (3,)), body.with_end_effector(robot)
-        positions, parts = more.positions(robot, q), [body.on_pedestal, body.on_moving_links]
+        positions, parts = more.positions(robot, q), [robot.pedestal, robot.links]
         together = np.concatenate([part.positions(robot, q) for part in parts], axis=1)
         np.testing.assert_array_equal(together, body.positions(robot, q))
         np.testing.assert_array_equal(together, positions[:, :-1])
@@ -167,7 +168,7 @@ class TestPositions:
 @pytest.mark.parametrize("diameter", [0.02, 0.15, 0.4])
 def test_where_the_spheres_clear_an_obstacle_the_meshes_clear_it_by_at_least_as_much(body, robot, seed, diameter):
     """And by no more than they stick out. What is smaller or elsewhere is found out, by coal's distances of meshes."""
-    model, rng, checked, found_out = load_collision_model(), np.random.default_rng(seed), 0, np.zeros(3, int)
+    model, rng, checked, found_out = load_jaco().collision, np.random.default_rng(seed), 0, np.zeros(3, int)
     for q in random_configurations(robot, seed, (40,)):
         # An obstacle near some sphere, though perhaps in the way of another.
         beside = rng.integers(len(body.joint))
@@ -190,8 +191,8 @@ def test_where_the_spheres_clear_an_obstacle_the_meshes_clear_it_by_at_least_as_
 
 def test_links_keep_at_least_as_far_from_each_other_as_their_spheres_and_hardly_farther(body, robot):
     """By coal's distances of meshes."""
-    model, paths = load_collision_model(), random_configurations(robot, 1, (300, 1))
-    found = [(model.nearest_to_itself(q), body.self_clearance(robot, q, SELF_REACH)) for q in paths]
+    model, paths = load_jaco().collision, random_configurations(robot, 1, (300, 1))
+    found = [(model.nearest_to_itself(q), robot.self_clearance(q, SELF_REACH)) for q in paths]
     near = [(nearest.distance, asked) for nearest, asked in found if nearest is not None]
     apart = [true - asked for true, asked in near if true > 0]
     assert len(apart) > 20

@@ -21,11 +21,11 @@ from dt_viz.robot.collision import (
     CollisionModel,
     CollisionReport,
     Nearest,
-    load_collision_model,
 )
 from dt_viz.robot.inverse_kinematics import inverse_kinematics, track
 from dt_viz.robot.link_distances import RESOLUTION, SELF_TOLERANCE, SHAPE_TOLERANCE, TOLERANCE
-from dt_viz.robot.robot import LinkMesh, collision_meshes
+from dt_viz.robot.meshes import LinkMesh
+from dt_viz.robot.robot import load_jaco
 from dt_viz.warning import ARM, Kind, MotionWarning
 
 FOLDED = np.array([0.0, np.pi, 0.5, 0.0, 5.7, 0.0])  # the hand in the upper arm
@@ -34,16 +34,16 @@ seeds = st.integers(0, 2**32 - 1)
 
 @pytest.fixture(scope="module")
 def model() -> CollisionModel:
-    return load_collision_model()
+    return load_jaco().collision
 
 
 @lru_cache(maxsize=1)
 def solids() -> tuple[trimesh.Trimesh, ...]:
-    return tuple(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False) for mesh in collision_meshes())
+    return tuple(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False) for mesh in load_jaco().meshes)
 
 
 def some_configurations(seed: int, num: int) -> np.ndarray:
-    return random_configurations(load_collision_model().robot, seed, (num,))
+    return random_configurations(load_jaco(), seed, (num,))
 
 
 def random_path(seed: int, num: int = 12) -> np.ndarray:
@@ -60,7 +60,7 @@ def in_frame(mesh: LinkMesh, q: np.ndarray, point: np.ndarray) -> np.ndarray:
     """A point (3,) of the base frame, in the frame of the link's joint."""
     if mesh.joint < 0:
         return point
-    rotations, origins = load_collision_model().robot.forward_kinematics(q)
+    rotations, origins = load_jaco().collision.robot.forward_kinematics(q)
     return rotations[mesh.joint].T @ (point - origins[mesh.joint])
 
 
@@ -74,7 +74,7 @@ class TestObstacle:
         vertices = [rng.choice(np.concatenate(placed_vertices(one))) for one in q]
         for one, vertex in zip(q, vertices, strict=True):
             centre = vertex + rng.normal(scale=0.03, size=3)
-            local = [in_frame(mesh, one, centre) for mesh in collision_meshes()]
+            local = [in_frame(mesh, one, centre) for mesh in load_jaco().meshes]
             expected = []
             for solid, point in zip(solids(), local, strict=True):
                 gap = trimesh.proximity.closest_point_naive(solid, point[None])[1][0]
@@ -115,7 +115,7 @@ class TestObstacle:
     @settings(max_examples=10)
     @given(seed=seeds, turn=st.floats(-3, 3))
     def test_turning_the_arm_and_the_obstacle_changes_nothing(self, seed, turn):
-        model, q = load_collision_model(), some_configurations(seed, 3)
+        model, q = load_jaco().collision, some_configurations(seed, 3)
         centre = model.robot.end_effector(q[0]) + np.array([0.05, 0.0, 0.1])
         turned = Rotation.from_rotvec([0.0, 0.0, -turn]).apply(centre)  # the first axis points down
         before, nearest = model.obstacle_distance(q, Sphere(tuple(centre)))
@@ -147,7 +147,7 @@ class TestShapes:
         inside = centre + np.random.default_rng(0).uniform(-1, 1, (3000, 3)) * obstacle.radius
         inside = inside[obstacle.signed_distance(inside) < -blur]
         common, outer = [], []
-        for mesh, solid, surface in zip(collision_meshes(), solids(), points, strict=True):
+        for mesh, solid, surface in zip(load_jaco().meshes, solids(), points, strict=True):
             turn, origin = (np.eye(3), np.zeros(3)) if mesh.joint < 0 else (rotations[mesh.joint], origins[mesh.joint])
             outer.append(np.concatenate([np.asarray(surface), mesh.vertices]) @ turn.T + origin)
             local = (inside - origin) @ turn
@@ -211,7 +211,7 @@ class TestBetweenSamples:
     @settings(max_examples=15)
     @given(seed=seeds, diameter=st.floats(0.02, 0.4), growth=st.floats(0.001, 0.2))
     def test_nothing_nearer_is_found_by_fine_sampling_and_what_is_found_is_there(self, seed, diameter, growth):
-        model, q = load_collision_model(), random_path(seed)
+        model, q = load_jaco().collision, random_path(seed)
         middle = model.robot.forward_kinematics(q[len(q) // 2])[1]
         ball = Sphere(tuple(middle[seed % 6] + np.array([0.1, 0.0, 0.05])), diameter)
         found = model.nearest_to_obstacle(q, ball)
@@ -272,7 +272,7 @@ class TestItself:
     @settings(max_examples=8)
     @given(seed=seeds)
     def test_nothing_nearer_is_found_by_fine_sampling(self, seed):
-        model, q = load_collision_model(), random_path(seed)
+        model, q = load_jaco().collision, random_path(seed)
         found = model.nearest_to_itself(q)
         for one in finely(q, 30):
             alone = model.nearest_to_itself(one[None])
@@ -291,7 +291,7 @@ class TestTable:
     def test_heights_are_those_of_the_vertices(self, seed):
         q = some_configurations(seed, 1)
         lowest = [vertices[:, 2].min() for vertices in placed_vertices(q[0])]
-        found = load_collision_model().nearest_to_table(q)
+        found = load_jaco().collision.nearest_to_table(q)
         np.testing.assert_allclose(found.distance, min(lowest[2:]), atol=1e-9)
 
     def test_a_hand_below_the_table_is_named(self, model, robot):
@@ -311,7 +311,7 @@ class TestTable:
     @settings(max_examples=10)
     @given(seed=seeds)
     def test_nothing_lower_is_found_by_fine_sampling(self, seed):
-        model, q = load_collision_model(), random_path(seed)
+        model, q = load_jaco().collision, random_path(seed)
         found = model.nearest_to_table(q).distance
         assert found <= min(model.nearest_to_table(one[None]).distance for one in finely(q, 40)) + TOLERANCE
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
 
 from dt_viz.robot.inverse_kinematics import TrackedPath, UnreachableError, inverse_kinematics, track
-from dt_viz.robot.robot import NUM_JOINTS, Robot, load_jaco
+from dt_viz.robot.robot import Robot, load_jaco
 
 BOX = np.array([[-0.4, -0.65, 0.05], [0.4, -0.3, 0.75]])  # where the tasks live, metres
 STEPS = 5 * load_jaco().tracking.step_tolerance  # rad, that a posture may be away from the best one
@@ -82,7 +82,7 @@ class TestTracking:
 
     def test_a_single_waypoint_is_a_path(self, robot):
         result = track(robot, [[0.1, -0.5, 0.3]], robot.home)
-        assert result.q.shape == (1, NUM_JOINTS)
+        assert result.q.shape == (1, robot.num_joints)
         assert result.error[0] < 1e-4
 
     def test_keeps_the_hands_direction_better_than_the_plain_pseudo_inverse(self, robot):
@@ -168,7 +168,7 @@ class TestTracking:
         paths = np.stack([smooth_path(seed) for seed in range(4)])
         starts = np.stack([inverse_kinematics(robot, path[0]) for path in paths])
         together = track(robot, paths, starts)
-        assert together.q.shape == (4, 200, NUM_JOINTS)
+        assert together.q.shape == (4, 200, robot.num_joints)
         assert together.error.shape == (4, 200)
         for path, start, q in zip(paths, starts, together.q, strict=True):
             np.testing.assert_allclose(q, track(robot, path, start).q, atol=0.01)

@@ -10,7 +10,6 @@ from hypothesis.extra.numpy import arrays
 from oracles import used_fraction
 
 from dt_viz.robot.retiming import NEGLIGIBLE, RAMP, within_velocity_limits
-from dt_viz.robot.robot import NUM_JOINTS
 
 LIMITS = np.array([0.6, 0.6, 0.6, 0.8, 0.8, 0.8])
 
@@ -28,8 +27,8 @@ def motions(draw, min_points=1):
     steps = st.sampled_from([0.0, 1e-9, 1e3]) | st.floats(-0.2, 0.2, allow_subnormal=False)
     start = draw(st.sampled_from([0.0, -3.7]))
     times = start + np.cumsum(np.append(0.0, draw(arrays(np.float64, num - 1, elements=intervals))))
-    turns = draw(arrays(np.float64, (num - 1, NUM_JOINTS), elements=steps))
-    return Motion(times, np.cumsum(np.vstack([np.ones(NUM_JOINTS), turns]), axis=0))
+    turns = draw(arrays(np.float64, (num - 1, len(LIMITS)), elements=steps))
+    return Motion(times, np.cumsum(np.vstack([np.ones(len(LIMITS)), turns]), axis=0))
 
 
 def rounding(*times):
@@ -46,7 +45,7 @@ def burst(num=2001, speed_up=3.0, duration=0.1):
     times = np.linspace(0.0, 4.0, num)
     fast = np.abs((times[1:] + times[:-1]) / 2 - 2.0) < duration / 2
     speed = 0.9 * LIMITS[1] * np.where(fast, speed_up, 1.0)
-    q = np.zeros((num, NUM_JOINTS))
+    q = np.zeros((num, len(LIMITS)))
     q[1:, 1] = np.cumsum(speed * np.diff(times))
     return Motion(times, q)
 
@@ -120,7 +119,7 @@ class TestRetiming:
         ids=["a jump", "between two jumps", "two at once", "nearly at once", "two", "one"],
     )
     def test_a_jump_is_crossed_at_the_limit_from_rest_and_between_two_the_motion_goes_on(self, times, turns, intervals):
-        q = np.repeat(np.array(turns)[:, None], NUM_JOINTS, axis=1)
+        q = np.repeat(np.array(turns)[:, None], len(LIMITS), axis=1)
         new = within_velocity_limits(np.array(times), q, LIMITS)
         assert new[0] == times[0]
         np.testing.assert_allclose(np.diff(new), intervals, rtol=1e-12)

@@ -16,10 +16,7 @@ from pinocchio_arm import pinocchio_configuration, pinocchio_model, placed_verti
 
 from dt_viz.robot.robot import (
     END_EFFECTOR_FRAME,
-    NUM_JOINTS,
-    collision_meshes,
     load_jaco,
-    package_folder,
     urdf_path,
 )
 
@@ -42,11 +39,11 @@ class TestModel:
         with pytest.raises(ValueError, match="read-only"):
             robot.lower[1] = 0.0
 
-    def test_meshes_resolve_in_the_package_folder(self):
-        meshes = [mesh.get("filename", "") for mesh in ElementTree.parse(urdf_path()).iter("mesh")]
+    def test_meshes_resolve_in_the_package_folder(self, robot):
+        meshes = [mesh.get("filename", "") for mesh in ElementTree.parse(robot.urdf).iter("mesh")]
         assert len(meshes) > 10
         for mesh in meshes:
-            assert (package_folder() / mesh.removeprefix("package://")).is_file()
+            assert (robot.package_dirs[0] / mesh.removeprefix("package://")).is_file()
 
     @pytest.mark.parametrize(
         ("package", "words"),
@@ -62,7 +59,7 @@ class TestModel:
 
 
 class TestKinematics:
-    @given(q=arrays(np.float64, (NUM_JOINTS,), elements=st.floats(-2 * np.pi, 2 * np.pi)))
+    @given(q=arrays(np.float64, (6,), elements=st.floats(-2 * np.pi, 2 * np.pi)))
     def test_places_and_their_derivatives_are_those_of_pinocchio(self, q):
         robot, (model, data, *_) = load_jaco(), pinocchio_model()
         hand, turned = model.getFrameId(END_EFFECTOR_FRAME), pinocchio_configuration(q)
@@ -70,7 +67,7 @@ class TestKinematics:
         np.testing.assert_allclose(robot.jacobian(q), expected[:3], atol=1e-12)
         pin.framesForwardKinematics(model, data, turned)
         rotations, origins = robot.forward_kinematics(q)
-        for i in range(NUM_JOINTS):
+        for i in range(robot.num_joints):
             np.testing.assert_allclose(rotations[i], data.oMi[i + 1].rotation, atol=1e-12)
             np.testing.assert_allclose(origins[i], data.oMi[i + 1].translation, atol=1e-12)
         np.testing.assert_allclose(robot.end_effector(q), data.oMf[hand].translation, atol=1e-12)
@@ -86,14 +83,16 @@ class TestKinematics:
                 np.testing.assert_allclose(function(q)[index], function(q[index]), atol=1e-13)
 
     def test_joint_frames_equal_the_viewers_scene_tree(self, robot):
-        urdf = yourdfpy.URDF.load(str(urdf_path()), load_meshes=False, build_scene_graph=True)
+        urdf = yourdfpy.URDF.load(str(robot.urdf), load_meshes=False, build_scene_graph=True)
         assert tuple(urdf.actuated_joint_names) == robot.joint_names
         for q in random_configurations(robot, 1, (10,)):
             urdf.update_cfg(q)
             np.testing.assert_allclose(np.linalg.norm(robot.joint_frames(q), axis=-1), 1, rtol=0, atol=1e-12)
+            before = urdf.base_link
             for name, wxyz in zip(robot.joint_names, robot.joint_frames(q), strict=True):
-                joint = urdf.joint_map[name]
-                expected = urdf.get_transform(joint.child, joint.parent)[:3, :3]
+                link = urdf.joint_map[name].child
+                expected = urdf.get_transform(link, before)[:3, :3]
+                before = link
                 np.testing.assert_allclose(pin.Quaternion(*wxyz).matrix(), expected, atol=1e-9)
 
 
@@ -101,21 +100,21 @@ class TestLinkMeshes:
     def test_they_move_as_in_pinocchio(self, robot):
         for q in random_configurations(robot, 2, (5,)):
             rotations, origins = robot.forward_kinematics(q)
-            for mesh, expected in zip(collision_meshes(), placed_vertices(q), strict=True):
+            for mesh, expected in zip(load_jaco().meshes, placed_vertices(q), strict=True):
                 vertices = mesh.vertices
                 if mesh.joint >= 0:
                     vertices = vertices @ rotations[mesh.joint].T + origins[mesh.joint]
                 np.testing.assert_allclose(vertices, expected, atol=1e-12)
 
     def test_they_are_the_links_of_the_urdf(self):
-        root = ElementTree.parse(urdf_path()).getroot()
+        root = ElementTree.parse(load_jaco().urdf).getroot()
         with_shape = {
             link.get("name") for link in root.iter("link") if link.find("collision/geometry/mesh") is not None
         }
-        assert {mesh.name for mesh in collision_meshes()} == with_shape
-        assert [mesh.joint for mesh in collision_meshes()] == [-1, 0, 1, 2, 3, 4, 5, 5, 5, 5, 5]
+        assert {mesh.name for mesh in load_jaco().meshes} == with_shape
+        assert [mesh.joint for mesh in load_jaco().meshes] == [-1, 0, 1, 2, 3, 4, 5, 5, 5, 5, 5]
 
     def test_faces_join_vertices_that_each_occur_once(self):
-        for mesh in collision_meshes():
+        for mesh in load_jaco().meshes:
             assert len(np.unique(mesh.vertices, axis=0)) == len(mesh.vertices)
             np.testing.assert_array_equal(np.unique(mesh.faces), np.arange(len(mesh.vertices)))

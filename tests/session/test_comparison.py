@@ -18,7 +18,7 @@ from dt_viz.evaluate.held_out import frechet
 from dt_viz.evaluate.table1 import drawn
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
-from dt_viz.robot.collision import load_collision_model
+from dt_viz.robot.robot import load_jaco
 from dt_viz.scenario.paper_scenes import FIG_6_DIAMETER, FIG_6_PLACES
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.tasks import TASKS, TaskEntry, drawing_task
@@ -128,7 +128,7 @@ def test_scores_are_those_of_the_motions(beside):
     planner = METHODS[LIVE].fit(problem_of(engine.nominal(scenario).learned, engine.follower))
     joints = planner.plan(scenario.obstacle, task.starts).joints
     assert joints is not None
-    nearest = min(load_collision_model().nearest_to_obstacle(q, scenario.obstacle).distance for q in joints)
+    nearest = min(load_jaco().collision.nearest_to_obstacle(q, scenario.obstacle).distance for q in joints)
     assert last[LIVE].scores.arm_depth == pytest.approx(max(0.0, -nearest), abs=1e-3)
     assert last["ours"].scores.arm_depth == 0.0
 

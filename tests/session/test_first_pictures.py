@@ -6,7 +6,7 @@ import pytest
 from dt_viz.motion.certificates import MAX_ROUND_TRIP
 from dt_viz.motion.diagnostics import MARGIN_TOLERANCE
 from dt_viz.motion.stack import FINE
-from dt_viz.robot.collision import load_collision_model
+from dt_viz.robot.robot import load_jaco
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.frame import Stage
 from dt_viz.ui.visitor import initial_scenario
@@ -31,7 +31,7 @@ def test_every_check_of_the_first_picture_holds(engine, at_rest, robot, task):
     assert np.unique(arm.index).tolist() == list(range(len(frame.task.paths)))
 
     def clearance(q):
-        return min(load_collision_model().obstacle_distance(q, part)[0].min() for part in scenario.obstacles)
+        return min(load_jaco().collision.obstacle_distance(q, part)[0].min() for part in scenario.obstacles)
 
     if task != "drop_pots":  # there it stands beyond the pots
         assert clearance(arm.q) < margin - MARGIN_TOLERANCE

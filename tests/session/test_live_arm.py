@@ -10,7 +10,7 @@ from dt_viz.control.controller import Phase
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.metrics import distance_from_path
 from dt_viz.obstacles.shapes import Sphere, as_point
-from dt_viz.robot.collision import load_collision_model
+from dt_viz.robot.robot import load_jaco
 from dt_viz.session.frame import Stage
 from dt_viz.session.robot_loop import LiveArm, RoundSettings
 
@@ -68,7 +68,7 @@ class Loop:
 
     def assert_free(self, obstacle=None, since=0):
         """The arm has touched nothing since it was in the posture of that number."""
-        near = load_collision_model().nearest_to_obstacle(
+        near = load_jaco().collision.nearest_to_obstacle(
             np.array(self.passed[since:]), obstacle or self.scenario.obstacle
         )
         assert near.distance > 0

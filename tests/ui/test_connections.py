@@ -23,6 +23,7 @@ from websockets.typing import Subprotocol
 
 from dt_viz.evaluate.protocol_client import OBSTACLE, LostError, ProtocolClient
 from dt_viz.obstacles.files import MAX_BYTES
+from dt_viz.robot.robot import load_jaco
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.progress import Pace
 from dt_viz.ui import gate
@@ -63,8 +64,9 @@ class Client(ProtocolClient):
 @pytest.fixture(scope="module")
 def server(fits):
     allowed = [Origin.parse("https://demo.example.org")]
+    places, waiting = NUM_PLACES, MAX_WAITING
     server = Server(
-        TASKS, fits, task="draw_s", port=0, max_sessions=NUM_PLACES, max_waiting=MAX_WAITING, allowed=allowed
+        TASKS, fits, load_jaco(), task="draw_s", port=0, max_sessions=places, max_waiting=waiting, allowed=allowed
     )
     yield server
     server.close()

@@ -38,8 +38,8 @@ def no_arm(_places):
 def test_a_grid_leaves_out_where_the_arm_that_is_to_avoid_the_obstacle_touches_it(engine, initial, robot):
     task, scenario = engine.task("draw_s"), changed(initial("draw_s"), space="cspace")
     arm_room = partial(room_at_rest, robot, task, scenario.obstacle)
-    grid = with_grid(scenario, task.slice, arm_room)
-    hand_only = with_grid(changed(scenario, space="task"), task.slice, no_arm)
+    grid = with_grid(scenario, task.slice, arm_room, robot.reaches)
+    hand_only = with_grid(changed(scenario, space="task"), task.slice, no_arm, robot.reaches)
     assert set(grid.starts) < set(hand_only.starts) and grid.num_blocked > hand_only.num_blocked
     nominal = engine.nominal(replace(scenario, starts=grid.starts))
     assert engine.follower.admission(nominal, scenario.arm_avoidance).nominal.moving.all()
@@ -48,17 +48,17 @@ def test_a_grid_leaves_out_where_the_arm_that_is_to_avoid_the_obstacle_touches_i
     np.testing.assert_allclose(room, arm_room(places_of(grid.starts)), atol=1e-3)
 
 
-def test_a_grid_leaves_out_what_is_in_the_obstacle_or_out_of_reach_and_places_that_are_taken(engine, initial):
+def test_a_grid_leaves_out_what_is_in_the_obstacle_or_out_of_reach_and_places_that_are_taken(engine, initial, robot):
     area = engine.task("draw_s").slice
     x, y, z = area.at(np.array([INNER, INNER / 3]) * area.half_size)
     scenario = changed(initial("draw_s"), obstacles=(Sphere((float(x), float(y), float(z))),))
-    grid = with_grid(scenario, area, no_arm)
+    grid = with_grid(scenario, area, no_arm, robot.reaches)
     assert len(grid.starts) + grid.num_blocked + grid.num_far == 16 and grid.num_blocked > 0
     assert (scenario.obstacle.signed_distance(places_of(grid.starts)) >= scenario.avoidance.margin).all()
     np.testing.assert_allclose((places_of(grid.starts) - area.centre) @ area.normal, 0, atol=1e-9)
-    again = with_grid(replace(scenario, starts=grid.starts), area, no_arm)
+    again = with_grid(replace(scenario, starts=grid.starts), area, no_arm, robot.reaches)
     assert again.starts == grid.starts
-    far = with_grid(scenario, replace(area, centre=area.centre + np.array([0.0, -2.0, 0.0])), no_arm)
+    far = with_grid(scenario, replace(area, centre=area.centre + np.array([0.0, -2.0, 0.0])), no_arm, robot.reaches)
     assert far.starts == () and far.num_far == 16
 
 

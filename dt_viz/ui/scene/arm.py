@@ -1,6 +1,6 @@
-"""The JACO arm in the browser, its ghost without avoidance, its body points, and arms along the motion.
+"""The arm in the browser, its ghost without avoidance, its body points, and arms along the motion.
 
-Meshes are sent once, then six rotations for each posture.
+Meshes are sent once, then a rotation for each joint for each posture.
 """
 
 from __future__ import annotations
@@ -13,21 +13,17 @@ import trimesh
 import viser
 from viser import transforms
 
-from dt_viz.avoidance.arm_field import LEVERS
 from dt_viz.flows.fields import Array
 from dt_viz.metrics import interpolate
-from dt_viz.robot.body_points import load_body_points
-from dt_viz.robot.robot import NUM_JOINTS, Robot
+from dt_viz.robot.robot import Robot
 from dt_viz.scenario.scenario import View
 from dt_viz.session.engine import ArmMotion
 from dt_viz.session.frame import Frame
-from dt_viz.ui.scene.links import bodies, light_shells
+from dt_viz.ui.scene.links import bodies, light_links
 from dt_viz.ui.scene.palette import LIGHT, linear
 from dt_viz.ui.scene.picture import Following, Lines, Look, Picture, Shown, add_label
 from dt_viz.ui.scene.style import STYLES
 
-PEDESTAL = 2
-"""Number of bodies that no motion moves away: the base, and link 1, which only spins."""
 SEEN = 4e-4
 """Smallest motion of the hand by a joint that is drawn, metres: a third of a pixel, about."""
 MIN_APART = 0.006
@@ -35,14 +31,14 @@ MIN_APART = 0.006
 
 
 class ArmFrames:
-    """The frames of the base and the six links as a tree in the scene of one visitor."""
+    """The frames of the base and the links as a tree in the scene of one visitor."""
 
     def __init__(self, scene: viser.SceneApi, robot: Robot, name: str) -> None:
-        unturned_and_half_turned = np.broadcast_to(np.array([[0.0], [np.pi]]), (2, NUM_JOINTS))
+        unturned_and_half_turned = np.broadcast_to(np.array([[0.0], [np.pi]]), (2, robot.num_joints))
         self._unturned, self._half_turned = robot.joint_frames(unturned_and_half_turned)
-        self._drawn = np.full(NUM_JOINTS, np.inf)
+        self._seen, self._drawn = SEEN / robot.levers, np.full(robot.num_joints, np.inf)
         self.frames: list[viser.FrameHandle] = []
-        for index, body in enumerate(bodies(robot.joint_names)):
+        for index, body in enumerate(bodies(robot)):
             name += f"/joint_{index}" if index else ""
             pose = transforms.SE3.from_matrix(body.placement)
             self.frames.append(
@@ -50,8 +46,8 @@ class ArmFrames:
             )
 
     def pose(self, q: Array) -> None:
-        """Take the joint angles `q` (6,), rad, as far as the change is seen: each joint is a message to the browser."""
-        turned = LEVERS * np.abs(q - self._drawn) > SEEN
+        """Take the joint angles `q` (n,), rad, as far as the change is seen: each joint is a message to the browser."""
+        turned = np.abs(q - self._drawn) > self._seen
         self._drawn = np.where(turned, q, self._drawn)
         c, s = np.cos(q / 2)[:, None], np.sin(q / 2)[:, None]
         wxyzs = c * self._unturned + s * self._half_turned  # a quaternion is linear in both
@@ -65,24 +61,24 @@ class ArmPicture(ArmFrames):
     def __init__(self, scene: viser.SceneApi, robot: Robot) -> None:
         super().__init__(scene, robot, "/arm")
         self.meshes: list[viser.MeshHandle] = []
-        for frame, body in zip(self.frames, bodies(robot.joint_names), strict=True):
-            for part, mesh, colour in (("shell", body.shell, LIGHT.arm), ("rings", body.rings, LIGHT.arm_ring)):
-                if mesh is not None:
-                    self.meshes.append(
-                        scene.add_mesh_simple(f"{frame.name}/{part}", mesh.vertices, mesh.faces, color=colour)
-                    )
+        self._moving = self.frames[1 + robot.num_fixed]
+        """Frame of the first link that motions move away from something."""
+        for frame, body in zip(self.frames, bodies(robot), strict=True):
+            for k, (colour, mesh) in enumerate(body.parts):
+                name = f"{frame.name}/part_{k}"
+                self.meshes.append(scene.add_mesh_simple(name, mesh.vertices, mesh.faces, color=colour))
         self._note = add_label(scene, f"{self.frames[-1].name}/note", "last good motion", visible=False)
         self.pose(robot.home)
 
     def show(self, *, whole: bool, pedestal: bool) -> None:
         """Show the whole arm, or only the pedestal under other pictures of it, or nothing."""
         self.frames[0].visible = whole or pedestal
-        self.frames[PEDESTAL].visible = whole
+        self._moving.visible = whole
 
     @property
     def visible(self) -> bool:
         """Whether the whole arm is shown."""
-        return self.frames[0].visible and self.frames[PEDESTAL].visible
+        return self.frames[0].visible and self._moving.visible
 
     @property
     def stale(self) -> bool:
@@ -101,15 +97,15 @@ class GhostArm(Shown):
 
     def __init__(self, scene: viser.SceneApi, robot: Robot, name: str = "/ghost_arm") -> None:
         """Make the arm, hidden, under a name in the scene tree."""
-        self._robot = robot
+        self._robot, shells = robot, light_links(robot)
         self._tree = ArmFrames(scene, robot, name)
         super().__init__(self._tree.frames[0])
         self.visible = False
-        shells = light_shells(robot.joint_names)[PEDESTAL:]
-        self._corners = np.stack([trimesh.bounds.corners(shell.bounds) for shell in shells])  # (5, 8, 3)
+        self._joints = list(shells)
+        self._corners = np.stack([trimesh.bounds.corners(shell.bounds) for shell in shells.values()])  # (L, 8, 3)
         self.links = tuple(
             scene.add_mesh_simple(
-                f"{frame.name}/shell",
+                f"{self._tree.frames[joint + 1].name}/shell",
                 shell.vertices,
                 shell.faces,
                 color=STYLES.arm_ghost.on(LIGHT),
@@ -117,15 +113,15 @@ class GhostArm(Shown):
                 cast_shadow=False,
                 receive_shadow=False,
             )
-            for frame, shell in zip(self._tree.frames[PEDESTAL:], shells, strict=True)
+            for joint, shell in shells.items()
         )
 
     def pose(self, q: Array, without: Array) -> None:
-        """Show the joint angles `without` (6,), rad, beside an arm at `q` (6,), rad."""
+        """Show the joint angles `without` (n,), rad, beside an arm at `q` (n,), rad."""
         self._tree.pose(without)
         rotations, origins = self._robot.forward_kinematics(np.stack([q, without]))
-        carried = slice(PEDESTAL - 1, None)
-        corners = self._corners @ rotations[:, carried].swapaxes(-1, -2) + origins[:, carried, None]  # (2, 5, 8, 3)
+        turned = self._corners @ rotations[:, self._joints].swapaxes(-1, -2)
+        corners = turned + origins[:, self._joints, None]  # (2, L, 8, 3)
         moved = np.linalg.norm(corners[1] - corners[0], axis=-1).max(axis=-1)
         for link, distance in zip(self.links, moved, strict=True):
             link.visible = bool(distance > MIN_APART)
@@ -136,7 +132,7 @@ NUM_ARMS = 6
 
 
 def arms_along(robot: Robot, motion: ArmMotion, num: int = NUM_ARMS) -> Array:
-    """Return joint angles (num, 6), rad, evenly along the path of the hand, its ends included."""
+    """Return joint angles (num, n), rad, evenly along the path of the hand, its ends included."""
     steps = np.linalg.norm(np.diff(robot.end_effector(motion.q), axis=0), axis=1)
     length = np.concatenate([[0.0], np.cumsum(steps + 1e-9)])  # strictly increasing, also where the hand rests
     return interpolate(np.linspace(0, length[-1], num), length, motion.q)
@@ -163,12 +159,12 @@ class ArmSequence(Following, Picture):
         self._robot = robot
         colour = np.array(linear(LIGHT.onion), np.uint8)
         opacities = np.linspace(0.12, 0.5, NUM_ARMS, dtype=np.float32)
-        self.links = tuple(
-            _add_copies(
-                scene, f"/onion/link_{index}", shell, NUM_ARMS, batched_colors=colour, batched_opacities=opacities
-            )
-            for index, shell in list(enumerate(light_shells(robot.joint_names)))[PEDESTAL:]
-        )
+        look = {"batched_colors": colour, "batched_opacities": opacities}
+        self.links = {
+            joint: _add_copies(scene, f"/onion/link_{joint + 1}", shell, NUM_ARMS, **look)
+            for joint, shell in light_links(robot).items()
+        }
+        """Pictures of the links, by joint."""
 
     def draw(self, frame: Frame, look: Look) -> None:
         self.follow(frame.arm)
@@ -176,7 +172,7 @@ class ArmSequence(Following, Picture):
     def _show(self, motion: ArmMotion) -> None:
         rotations, origins = self._robot.forward_kinematics(arms_along(self._robot, motion))
         wxyzs = transforms.SO3.from_matrix(rotations).wxyz
-        for joint, link in enumerate(self.links, start=PEDESTAL - 1):
+        for joint, link in self.links.items():
             # the browser blends nodes from far to near by their own positions
             link.position = middle = origins[:, joint].mean(axis=0)
             link.batched_positions = (origins[:, joint] - middle).astype(np.float32)
@@ -216,15 +212,14 @@ class Arms:
 
     def __init__(self, scene: viser.SceneApi, robot: Robot) -> None:
         self._robot = robot
-        self._points = load_body_points()
         self.arm = ArmPicture(scene, robot)
         self.ghost = GhostArm(scene, robot)
-        self.body = BodySpheres(scene, self._points.radius)
+        self.body = BodySpheres(scene, robot.body.radius)
         self._now = (robot.home, robot.home)
         self._posing = threading.Lock()  # the playback poses, another thread shows and hides
 
     def pose(self, q: Array, without: Array) -> None:
-        """Show the joint angles `q` (6,), rad, and those `without` avoidance (6,), rad."""
+        """Show the joint angles `q` (n,), rad, and those `without` avoidance (n,), rad."""
         with self._posing:
             self._now = (q, without)
             self.arm.pose(q)
@@ -243,4 +238,4 @@ class Arms:
         if self.ghost.visible:
             self.ghost.pose(q, without)
         if self.body.visible:
-            self.body.pose(*self._points.positions(self._robot, np.stack([q, without])))
+            self.body.pose(*self._robot.body.positions(self._robot, np.stack([q, without])))

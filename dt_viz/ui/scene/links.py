@@ -7,10 +7,10 @@ from functools import lru_cache
 
 import numpy as np
 import trimesh
-import yourdfpy
 
 from dt_viz.flows.fields import Array
-from dt_viz.robot.robot import package_folder, urdf_path
+from dt_viz.robot.robot import Robot
+from dt_viz.ui.scene.palette import LIGHT, Colour
 
 CELL = 0.005
 """Edge length of the cells in which a light mesh keeps one vertex, metres."""
@@ -18,45 +18,44 @@ CELL = 0.005
 
 @dataclass(frozen=True)
 class Body:
-    """The meshes that move with one joint."""
+    """The meshes that move with one joint, or those of the base."""
 
     placement: Array
-    """(4, 4) pose in the parent link, that of the base in the world; all joint angles zero, metres."""
-    shell: trimesh.Trimesh
-    rings: trimesh.Trimesh | None
+    """(4, 4) pose in the frame of the joint before, that of the base in the world; all joint angles zero, metres."""
+    parts: tuple[tuple[Colour, trimesh.Trimesh], ...]
+    """What has one colour, with it; none where nothing is drawn."""
 
 
-@lru_cache(maxsize=1)
-def bodies(joint_names: tuple[str, ...]) -> tuple[Body, ...]:
-    """Load the base and the six links with everything fixed to them, once for all visitors."""
-    urdf = yourdfpy.URDF.load(
-        str(urdf_path()), filename_handler=lambda fname: str(fname).replace("package://", f"{package_folder()}/")
-    )
-    scene = urdf.scene
-    assert scene is not None
-    moving = [urdf.joint_map[name] for name in joint_names]
-    links = [moving[0].parent, *(joint.child for joint in moving)]
-    parents = scene.graph.transforms.parents
-    shells: list[list[trimesh.Trimesh]] = [[] for _ in links]
-    rings: list[list[trimesh.Trimesh]] = [[] for _ in links]
-    for name, mesh in scene.geometry.items():
-        link = parents[name]
-        while link not in links:
-            link = parents[link]
-        placed = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-        placed.apply_transform(urdf.get_transform(name, link))
-        (rings if name.startswith("ring") else shells)[links.index(link)].append(placed)
-    result = []
-    for index, link in enumerate(links):
-        placement = urdf.get_transform(link, links[index - 1] if index else scene.graph.base_frame)
-        result.append(Body(placement, _merged(shells[index]), _merged(rings[index]) if rings[index] else None))
+@lru_cache(maxsize=4)
+def bodies(robot: Robot) -> tuple[Body, ...]:
+    """Join the meshes of the base and of each link with everything fixed to it, once for all visitors."""
+    result, still = [], (np.eye(3)[None], np.zeros((1, 3)))
+    turns, shifts = map(np.concatenate, zip(still, (robot.joint_rotations, robot.joint_translations), strict=True))
+    for joint, (turn, shift) in enumerate(zip(turns, shifts, strict=True), start=-1):
+        placement = np.eye(4)
+        placement[:3, :3], placement[:3, 3] = turn, shift
+        found: dict[Colour | None, list[trimesh.Trimesh]] = {}
+        for mesh in robot.visuals:
+            if mesh.joint == joint:
+                shape = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+                found.setdefault(mesh.colour, []).append(shape)
+        merged = {colour: _merged(meshes) for colour, meshes in found.items()}
+        result.append(Body(placement, tuple((colour or LIGHT.arm, mesh) for colour, mesh in merged.items())))
     return tuple(result)
 
 
-@lru_cache(maxsize=1)
-def light_shells(joint_names: tuple[str, ...]) -> tuple[trimesh.Trimesh, ...]:
-    """Return a mesh for the base and each link with at most a third of the triangles and without rings."""
-    return tuple(simplified(body.shell, CELL) for body in bodies(joint_names))
+@lru_cache(maxsize=4)
+def light_links(robot: Robot) -> dict[int, trimesh.Trimesh]:
+    """Meshes with at most a third of the triangles, by joint, of what motions move away from something.
+
+    Parts with a colour of their own, beside others in the arm's, are left out.
+    """
+    links = {}
+    for joint, body in enumerate(bodies(robot)[1:]):
+        plain = [mesh for colour, mesh in body.parts if colour == LIGHT.arm]
+        if joint >= robot.num_fixed and body.parts:
+            links[joint] = simplified(_merged(plain or [mesh for _, mesh in body.parts]), CELL)
+    return links
 
 
 def simplified(mesh: trimesh.Trimesh, cell: float) -> trimesh.Trimesh:

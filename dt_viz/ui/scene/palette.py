@@ -80,8 +80,8 @@ class Theme:
     body_point: Colour = (170, 178, 190)
     body_point_moved: Colour = (0, 158, 115)
     body_path: Colour = (0, 92, 66)
-    joints: tuple[Colour, ...] = (bias, demonstration, goal, level, rollout, obstacle)
-    """Curves of the six joints, base to hand."""
+    joints: tuple[Colour, ...] = (bias, demonstration, goal, level, rollout, obstacle, free, generator)
+    """Curves of the joints, base to hand; those of more begin again."""
     compared: tuple[Colour, ...] = (
         (120, 94, 200),
         (51, 34, 136),

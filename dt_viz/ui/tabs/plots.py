@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from viser import uplot
 
 from dt_viz.flows.fields import Array
 from dt_viz.motion.profiles import Profiles
-from dt_viz.robot.robot import NUM_JOINTS, Robot
+from dt_viz.robot.robot import Robot
 from dt_viz.session.engine import ArmMotion
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.palette import Colour, css
@@ -92,9 +93,9 @@ class JointCurves:
     times: Array
     """(N,) even times, seconds."""
     angles: Array
-    """(N, 6) joint angles, degrees, unwrapped."""
+    """(N, n) joint angles, degrees, unwrapped."""
     speeds: Array
-    """(N, 6) joint speeds, percent of the velocity limits."""
+    """(N, n) joint speeds, percent of the velocity limits."""
 
 
 def joint_curves(motion: ArmMotion, robot: Robot, num: int = NUM_SAMPLES) -> JointCurves:
@@ -115,15 +116,16 @@ class JointPlots(Following):
     def __init__(self, gui: viser.GuiApi, robot: Robot) -> None:
         """Make the folder, hidden."""
         self._robot = robot
-        limited = [j for j in range(NUM_JOINTS) if np.isfinite(robot.lower[j])]
+        limited = [j for j in range(robot.num_joints) if np.isfinite(robot.lower[j])]
         self._limits = np.degrees(np.stack([robot.lower[limited], robot.upper[limited]], axis=1)).ravel()
-        joints = [curve(f"{j}", colour) for j, colour in enumerate(palette.LIGHT.joints, start=1)]
-        limits = [curve("limit", palette.LIGHT.joints[j], width=1, dashed=True) for j in limited for _ in range(2)]
+        colours = [colour for colour, _ in zip(cycle(palette.LIGHT.joints), robot.joint_names, strict=False)]
+        joints = [curve(f"{j}", colour) for j, colour in enumerate(colours, start=1)]
+        limits = [curve("limit", colours[j], width=1, dashed=True) for j in limited for _ in range(2)]
         limit = curve("limit", palette.LIGHT.arm_ring, width=1, dashed=True)
         folder = gui.add_folder("Joints", visible=False)
         super().__init__(folder)
         with folder:
-            marks = {f"{j}": f"background:{css(colour)}" for j, colour in enumerate(palette.LIGHT.joints, start=1)}
+            marks = {f"{j}": f"background:{css(colour)}" for j, colour in enumerate(colours, start=1)}
             gui.add_html(legend(marks, "0.3em", "Joint"))
             self.angles = add_plot(gui, "Angle [°]; dashed: limits", "t [s]", (*joints, *limits), 170)
             title = f"Speed [% of its limit], up to {MAX_SPEED}; time [s]"

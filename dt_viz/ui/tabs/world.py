@@ -18,7 +18,6 @@ from dt_viz.obstacles import files as shapes
 from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, MeshObstacle, Obstacle, Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.inverse_kinematics import UnreachableError
-from dt_viz.robot.robot import load_jaco
 from dt_viz.scenario.scenario import MAX_DIAMETER, MAX_MARGIN, MAX_OBSTACLES, MIN_DIAMETER, Scenario
 from dt_viz.scenario.stack import (
     added,
@@ -277,9 +276,9 @@ def add_starts(gui: viser.GuiApi, bindings: Bindings) -> None:
 def add_grid(session: Session) -> None:
     """Add starts all over the slice."""
     scenario, task = session.scenario, session.task
-    arm_room = partial(room_at_rest, load_jaco(), task, scenario.obstacle)
+    arm_room = partial(room_at_rest, session.robot, task, scenario.obstacle)
     try:
-        grid = with_grid(scenario, task.slice.posed(scenario.view.slice), arm_room)
+        grid = with_grid(scenario, task.slice.posed(scenario.view.slice), arm_room, session.robot.reaches)
     except UnreachableError as error:
         session.say(f"the arm cannot reach the starts: {error}", Severity.WARNING)
         return

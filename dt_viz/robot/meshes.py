@@ -1,0 +1,34 @@
+"""Shapes of an arm's links: triangles that move with its joints."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from dt_viz.flows.fields import Array
+
+
+@dataclass(frozen=True, eq=False)
+class LinkMesh:
+    """Collision shape of a link; links that do not move, such as fingers, are those of the joint that carries them."""
+
+    name: str
+    """Name of the link in the URDF."""
+    joint: int
+    """Index of the joint that it moves with, −1 for the base."""
+    vertices: Array
+    """(V, 3) metres, in the frame of that joint; of the base in the base frame."""
+    faces: NDArray[np.intp]
+    """(F, 3) indices of vertices."""
+
+
+@dataclass(frozen=True, eq=False)
+class VisualMesh(LinkMesh):
+    """What is drawn of a link."""
+
+    colour: tuple[int, int, int] | None = None
+    """Red, green and blue up to 255; None is the page's colour of an arm."""
