@@ -82,7 +82,11 @@ class Ranges(NamedTuple):
 
 
 def find_front(
-    kinematics: Kinematics, ranges: Ranges, given: str | Sequence[float] | None, home: Array | None, settings: ChoiceSettings
+    kinematics: Kinematics,
+    ranges: Ranges,
+    given: str | Sequence[float] | None,
+    home: Array | None,
+    settings: ChoiceSettings,
 ) -> tuple[Array, str]:
     """Find the horizontal unit vector (2,) ahead of the arm in the base frame of its URDF, and say why.
 
@@ -97,7 +101,9 @@ def find_front(
         FormatError: what is given is no horizontal direction.
     """
     if given is not None:
-        front = np.array(AXES[given] if isinstance(given, str) and given in AXES else given if not isinstance(given, str) else ())
+        front = np.array(
+            AXES[given] if isinstance(given, str) and given in AXES else given if not isinstance(given, str) else ()
+        )
         if front.shape not in {(2,), (3,)} or not np.isfinite(front).all() or not np.linalg.norm(front[:2]) > 0:
             raise FormatError("front", repr(given), f"{', '.join(AXES)} or a horizontal direction (x, y)")
         return front[:2] / np.linalg.norm(front[:2]), "given"
@@ -105,7 +111,10 @@ def find_front(
         hand, why = kinematics.end_effector(home)[:2], "where the hand is at the given home"
     else:
         postures = ranges.random(np.random.default_rng(0), 2000)
-        hand, why = kinematics.end_effector(postures)[:, :2].mean(axis=0), "where the hand is in the mean of all postures"
+        hand, why = (
+            kinematics.end_effector(postures)[:, :2].mean(axis=0),
+            "where the hand is in the mean of all postures",
+        )
     if np.linalg.norm(hand) < settings.one_sided * kinematics.reach:
         return np.array(AXES["x"]), "x, by convention: the arm reaches to all sides"
     front = hand / np.linalg.norm(hand)
@@ -146,7 +155,9 @@ def find_touching(
     named = {frozenset(pair) for pair in apart} & excepted
     measure = BetweenLinks(CollisionModel(kinematics, meshes, 0).links, frozenset(named))
     near, names = settings.near * kinematics.reach, [mesh.name for mesh in meshes]
-    pairs = [pair for pair in combinations(range(len(meshes)), 2) if frozenset((names[pair[0]], names[pair[1]])) not in named]
+    pairs = [
+        pair for pair in combinations(range(len(meshes)), 2) if frozenset((names[pair[0]], names[pair[1]])) not in named
+    ]
     pairs = [(a, b) for a, b in pairs if meshes[b].joint - meshes[a].joint > 1]
     left = np.arange(len(pairs))
     counts = np.zeros(len(pairs), int)
@@ -156,7 +167,11 @@ def find_touching(
         for item in left[lower < near]:
             counts[item] += measure.distance(poses, 0, int(item), near) < near
         left = left[counts[left] >= settings.always * num - 1]  # the others are apart often enough
-    always = {frozenset(names[k] for k in pairs[item]) for item in left if counts[item] >= settings.always * settings.num_postures}
+    always = {
+        frozenset(names[k] for k in pairs[item])
+        for item in left
+        if counts[item] >= settings.always * settings.num_postures
+    }
     reasons = [f"{len(named)} of the SRDF"] if told else []
     reasons.append(f"{len(always)} nearer than {1e3 * near:.0f} mm in {settings.always:.0%} of random postures")
     return frozenset(named | always), ", ".join(reasons)
@@ -242,7 +257,12 @@ def semantic_homes(semantic: Element | None, joint_names: Sequence[str]) -> list
 
 
 def find_home(
-    search: HomeSearch, joint_names: Sequence[str], lower: Array, upper: Array, given: Array | None, semantic: Element | None
+    search: HomeSearch,
+    joint_names: Sequence[str],
+    lower: Array,
+    upper: Array,
+    given: Array | None,
+    semantic: Element | None,
 ) -> tuple[Array, str]:
     """Find the ready posture (n,), rad: given, a state of the SRDF, or searched for; and say why.
 
@@ -255,12 +275,16 @@ def find_home(
         outside = [name for name, bad in zip(joint_names, (given < lower) | (given > upper), strict=True) if bad]
         if outside:
             ranges = zip(joint_names, lower, upper, strict=True)
-            accepted = ", ".join(f"{name} from {low:.2f} to {high:.2f}" for name, low, high in ranges if name in outside)
+            accepted = ", ".join(
+                f"{name} from {low:.2f} to {high:.2f}" for name, low, high in ranges if name in outside
+            )
             raise FormatError("home", f"{given.round(3).tolist()} rad", accepted)
         return given, "given"
     told = []
     for name, posture in semantic_homes(semantic, joint_names):
-        objection = "it is outside the limits" if ((posture < lower) | (posture > upper)).any() else search.objection(posture)
+        objection = (
+            "it is outside the limits" if ((posture < lower) | (posture > upper)).any() else search.objection(posture)
+        )
         if objection is None:
             return posture, f"state {name!r} of the SRDF"
         told.append(f"not {name!r} of the SRDF: {objection}")

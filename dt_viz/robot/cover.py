@@ -23,7 +23,7 @@ from scipy.spatial import KDTree
 
 from dt_viz.kernels.arm import BODY_POINT
 from dt_viz.obstacles.triangles import grid_nodes, inside_of_grid, surface_samples
-from dt_viz.robot.robot import LinkMesh
+from dt_viz.robot.meshes import LinkMesh
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -38,19 +38,23 @@ Progress = Callable[[float], object]
 class CoverSettings:
     """Settings of a cover. Those of the file that ships with the JACO are in ``assets/make_body_points.py``."""
 
-    protrusion: float = 5e-3
+    protrusion: float = 5.5e-3
     """Distance by which the smallest spheres stick out of a link, metres."""
     spacing: float = 3e-3
     """Spacing of the points on the surface that spheres are chosen for, metres."""
     fine_spacing: float = 2e-3
     """Spacing of the points on the surface that their radii hold, metres."""
-    inner_spacing: float = 5e-3
+    inner_spacing: float = 4.5e-3
     """Spacing of the candidates in a link, metres."""
     outer_spacing: float = 3e-3
     """Spacing of the candidates on the surface, metres."""
     closing: float = 6e-3
     """Radius of balls that do not enter a link's hollows, metres: these count as solid, as what is open to
     one side alone. 0 leaves all hollows, and all candidates."""
+    rounding: float = 1.4
+    """Largest radius of a body point, in halves of its link's thickness."""
+    radii: tuple[float, float] = (0.03, 0.085)
+    """Least and largest value of that radius, in the arm's reach."""
     num_starts: int = 1
     """Number of beginnings of the clustering, the best of which is taken."""
     rounds: int = 12
@@ -63,7 +67,7 @@ class CoverSettings:
 
 GROUP = 0.02
 """Size of the cells in which points are compared with spheres, metres."""
-NEARLY = 0.8
+NEARLY = 0.9
 """Part of the distance of two places by which one is deeper whose sphere holds most of the other's."""
 Spheres = np.ndarray
 """(N, 4): centre and radius, metres."""
@@ -72,7 +76,7 @@ Spheres = np.ndarray
 def covering_tree(
     meshes: Sequence[LinkMesh],
     largest: Callable[[LinkMesh], float],
-    settings: CoverSettings = CoverSettings(),  # noqa: B008, frozen
+    settings: CoverSettings = CoverSettings(),
     progress: Progress = float,
 ) -> NDArray[np.void]:
     """Cover links with the spheres of `dt_viz.robot.body_points.BodyPoints`.
@@ -263,7 +267,9 @@ def _clusters(spheres: Spheres, largest: float, settings: CoverSettings) -> list
     rng = np.random.default_rng(0)
     for k in range(1, len(spheres) + 1):
         found = [
-            part for _ in range(settings.num_starts) for part in _clusterings(spheres, min(k, len(spheres)), rng, settings)
+            part
+            for _ in range(settings.num_starts)
+            for part in _clusterings(spheres, min(k, len(spheres)), rng, settings)
         ]
         radius, best = min(found, key=lambda found: found[0])
         if radius <= largest:
@@ -281,13 +287,13 @@ def _clusterings(
         nearest = (away + handicap).argmin(axis=1)
         kept = np.unique(nearest)
         clusters = [spheres[nearest == cluster] for cluster in kept]
-        around = np.array([_around(cluster) for cluster in clusters])
+        around = np.array([bounding_sphere(cluster) for cluster in clusters])
         yield around[:, 3].max(), clusters
         centres, handicap = around[:, :3], handicap[kept] + settings.evening * (around[:, 3] - around[:, 3].mean())
 
 
-def _around(spheres: Spheres) -> Array:
-    """Find the smallest sphere (4,) around others, about: its centre steps towards the farthest (Bădoiu and Clarkson)."""
+def bounding_sphere(spheres: Spheres) -> Array:
+    """Find the smallest sphere (4,) around others, about: its centre steps to the farthest (Bădoiu and Clarkson)."""
     centre = spheres[:, :3].mean(axis=0)
     for step in range(2, 100):
         farthest = (np.linalg.norm(spheres[:, :3] - centre, axis=1) + spheres[:, 3]).argmax()
@@ -309,5 +315,5 @@ def _tree(spheres: Spheres, num_leaves: int) -> tuple[Spheres, Indices]:
         order = spheres[:, along].argsort()
         parts = [spheres[half] for half in np.array_split(order, 2)]
     trees = [_tree(part, num_leaves) for part in parts]
-    nodes = np.concatenate([_around(spheres)[None], *(nodes for nodes, _ in trees)])
+    nodes = np.concatenate([bounding_sphere(spheres)[None], *(nodes for nodes, _ in trees)])
     return nodes, np.concatenate([[len(nodes)], *(sizes for _, sizes in trees)])

@@ -1,7 +1,7 @@
 """Shapes of an arm's links, read from a URDF: solids for collisions, and coloured meshes that are drawn.
 
-Pinocchio reads a URDF that is reduced to what is needed: joints that are no part of the chain (grippers, other branches)
-are fixed, and addresses of meshes are paths. Links without collision shapes have those that are drawn.
+Pinocchio reads a URDF that is reduced to what is needed: joints that are no part of the chain (grippers, other
+branches) are fixed, and addresses of meshes are paths. Links without collision shapes have those that are drawn.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -27,8 +27,6 @@ from dt_viz.robot.tool_chain import ArmChain
 from dt_viz.robot.urdf import Description
 
 if TYPE_CHECKING:
-    from xml.etree.ElementTree import Element
-
     from numpy.typing import ArrayLike
 
     from dt_viz.flows.fields import Array, Indices
@@ -37,7 +35,7 @@ SHAPES = ("box", "cylinder", "sphere", "mesh")
 COLOURED = (".dae", ".obj", ".glb", ".gltf", ".ply")
 """Suffixes of files of meshes that have colours of their own."""
 SHORTEST_HAND = 0.03
-"""Least distance of the tool from the last joint for that to be the hand's direction, metres; else it is the tool's z."""
+"""Least distance of the tool from the last joint for that to be the hand's direction, metres; else that is its z."""
 
 
 class Reduced(NamedTuple):
@@ -84,11 +82,15 @@ def reduced(description: Description, chain: ArmChain, package_dirs: Sequence[Pa
         if name in moving:
             kept.extend(part for tag in ("origin", "axis") for part in joint.element.iterfind(tag))
             lower, upper, velocity = np.nan_to_num(joint.limits, posinf=0.0, neginf=0.0).tolist()
-            ElementTree.SubElement(kept, "limit", lower=f"{lower!r}", upper=f"{upper!r}", velocity=f"{velocity!r}", effort="0")
+            ElementTree.SubElement(
+                kept, "limit", lower=f"{lower!r}", upper=f"{upper!r}", velocity=f"{velocity!r}", effort="0"
+            )
         elif chain.locked.get(name):
             turn, place = joint.moved(chain.locked[name])
             rpy = Rotation.from_matrix(turn).as_euler("xyz")
-            ElementTree.SubElement(kept, "origin", xyz=" ".join(map(repr, place.tolist())), rpy=" ".join(map(repr, rpy.tolist())))
+            ElementTree.SubElement(
+                kept, "origin", xyz=" ".join(map(repr, place.tolist())), rpy=" ".join(map(repr, rpy.tolist()))
+            )
         else:
             kept.extend(joint.element.iterfind("origin"))
     root.extend(description.materials)
@@ -107,7 +109,9 @@ def _mesh_file(address: str, urdf: Path, package_dirs: Sequence[Path], field: st
     for path in candidates:
         if path.is_file():
             return path.resolve()
-    looked = f"a file; looked in {candidates[0]}" + (" and others; name its package_dirs=" if len(candidates) > 1 else "")
+    looked = f"a file; looked in {candidates[0]}" + (
+        " and others; name its package_dirs=" if len(candidates) > 1 else ""
+    )
     raise FormatError(field, f"no mesh {address!r}", looked)
 
 
@@ -134,10 +138,15 @@ def read_shapes(text: str, chain: ArmChain) -> Shapes:
     before = [np.eye(3), *turns]
     places = model.jointPlacements[1:]
     hand = model.frames[model.getFrameId(chain.tool, pin.FrameType.BODY)].placement
-    offset = _turned(hand.translation, turns[-1])
+    offset = _turned(hand.translation + hand.rotation @ chain.offset, turns[-1])
     far = float(np.linalg.norm(offset)) > SHORTEST_HAND
     kinematics = Kinematics(
-        constant([_turned(place.rotation.T, first).T @ turn for place, first, turn in zip(places, before, turns, strict=False)]),
+        constant(
+            [
+                _turned(_turned(place.rotation.T, first).T, turn)
+                for place, first, turn in zip(places, before, turns, strict=False)
+            ]
+        ),
         constant([_turned(place.translation, first) for place, first in zip(places, before, strict=False)]),
         constant(offset),
         constant(offset if far else _turned(hand.rotation[:, 2], turns[-1])),

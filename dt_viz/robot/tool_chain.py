@@ -9,13 +9,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dt_viz.errors import FormatError
+from dt_viz.kernels.blocks import MOST_JOINTS
+from dt_viz.robot.robot import LEAST_JOINTS
 from dt_viz.robot.urdf import TURNING, Description, Joint, listed, numbers
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
-NUM_JOINTS = (3, 12)
-"""Smallest and largest number of joints of a chain."""
+    from dt_viz.flows.fields import Array
+
 GRIPPER = ("finger", "gripper", "jaw", "knuckle", "thumb")
 """Words in the names of joints and links at the end of a chain that are a gripper's."""
 TOOL_WORDS = ("tcp", "tool0", "ee_link", "end_effector", "link_eef", "gripper_frame", "grasp", "tool", "flange", "hand")
@@ -33,11 +35,13 @@ class ArmChain:
     """Values of the joints that do not move, rad or metres."""
     why: str
     """Reason for the tool."""
+    offset: Array
+    """(3,) place of the tool in that link, metres."""
 
 
 def find_chain(
     description: Description,
-    end_effector: str | None = None,
+    end_effector: str | tuple[str, Sequence[float]] | None = None,
     locked: Sequence[str] | Mapping[str, float] | None = None,
     semantic: Element | None = None,
 ) -> ArmChain:
@@ -45,29 +49,36 @@ def find_chain(
 
     Args:
         description: of the robot.
-        end_effector: link that is the tool frame, or the joint that carries it. By default that of the SRDF, else one
-            with a usual name, else the farthest one.
+        end_effector: link that is the tool frame, or the joint that carries it, perhaps with the place (x, y, z) of the
+            tool in it, metres. By default that of the SRDF, else one with a usual name, else the farthest one.
         locked: joints of the chain that do not move, perhaps each with its value, rad or metres. By default grippers.
         semantic: root of an SRDF.
 
     Raises:
         FormatError: There is no such frame, or a joint of the chain does not turn.
     """
-    given = dict(locked) if isinstance(locked, Mapping) else {name: _resting(description, name) for name in locked or ()}
-    tool, why = _tool(description, end_effector, given, semantic)
+    given = (
+        dict(locked) if isinstance(locked, Mapping) else {name: _resting(description, name) for name in locked or ()}
+    )
+    frame, offset = (end_effector, (0.0, 0.0, 0.0)) if isinstance(end_effector, str | None) else end_effector
+    place = np.array(offset, dtype=float)
+    if place.shape != (3,) or not np.isfinite(place).all():
+        raise FormatError("end effector", f"the place {offset!r}", "a link, or (link, (x, y, z)) in metres")
+    tool, why = _tool(description, frame, given, semantic)
     path = _moving(description, tool, given)
     for joint in path:
         if joint.kind not in TURNING or joint.element.find("mimic") is not None:
             found = "a mimic joint" if joint.kind in TURNING else f"a {joint.kind} joint"
             accepted = f"revolute and continuous joints from {description.root} to {tool}, the tool"
             raise FormatError(f"joint {joint.name}", found, f"{accepted}; or lock it: locked=[{joint.name!r}]")
-    low, high = NUM_JOINTS
-    if not low <= len(path) <= high:
-        accepted = f"{low} to {high}; choose another end_effector=, or lock some: locked=[…]"
+    if not LEAST_JOINTS <= len(path) <= MOST_JOINTS:
+        accepted = f"{LEAST_JOINTS} to {MOST_JOINTS}; choose another end_effector=, or lock some: locked=[…]"
         raise FormatError(f"chain from {description.root} to {tool}", f"{len(path)} joints that move", accepted)
     names = {joint.name for joint in path}
     still = [name for name, joint in description.joints.items() if joint.moves and name not in names]
-    return ArmChain(tuple(path), tool, {name: given.get(name, _resting(description, name)) for name in still}, why)
+    return ArmChain(
+        tuple(path), tool, {name: given.get(name, _resting(description, name)) for name in still}, why, place
+    )
 
 
 def _tool(

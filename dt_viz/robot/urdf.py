@@ -115,7 +115,9 @@ class Description:
                     raise FormatError(f"joint {joint.name}", f"link {link!r}, which is not there", listed(self.links))
             if joint.child in self.into:
                 found = f"two joints that carry it, {self.into[joint.child].name} and {joint.name}"
-                raise FormatError(f"link {joint.child}", found, "a tree, where each link is carried by one joint: no loops")
+                raise FormatError(
+                    f"link {joint.child}", found, "a tree, where each link is carried by one joint: no loops"
+                )
             self.into[joint.child] = joint
         roots = [link for link in self.links if link not in self.into]
         if len(roots) != 1:
