@@ -26,7 +26,7 @@ class Course:
     times: Array
     """(K,) seconds."""
     q: Array
-    """(K, 6) rad."""
+    """(K, n) rad."""
     z: Array
     """(K, k) base coordinates; the hand's place where nothing is learned."""
 
@@ -36,14 +36,14 @@ class Course:
         return float(self.times[-1])
 
     def at(self, clock: float) -> Array:
-        """Posture (6,) at a time."""
+        """Posture (n,) at a time."""
         coefficients, begins = self._curve
         segment = max(bisect_right(begins, clock) - 1, 0)
         u = min(max(clock, begins[0]), self.end) - begins[segment]
         return np.array([u * u * u, u * u, u, 1.0]) @ coefficients[segment]
 
     def after(self, clock: float) -> Array:
-        """Postures (K', 6) from a time on, up to the end."""
+        """Postures (K', n) from a time on, up to the end."""
         return np.concatenate([self.at(clock)[None], self.q[self.times > clock]])
 
     def image(self, clock: float) -> Array:
@@ -51,12 +51,12 @@ class Course:
         return np.array([np.interp(clock, self.times, z) for z in self.z.T])
 
     def slowed(self, limits: Array) -> Course:
-        """Return it within limits (6,) of the joints' velocities, rad/s."""
+        """Return it within limits (n,) of the joints' velocities, rad/s."""
         return replace(self, times=within_velocity_limits(self.times, self.q, limits))
 
     @cached_property
     def _curve(self) -> tuple[Array, list[float]]:
-        """Coefficients (K − 1, 4, 6) of a cubic in each segment, and where these begin."""
+        """Coefficients (K − 1, 4, n) of a cubic in each segment, and where these begin."""
         h, slopes = np.diff(self.times)[:, None], np.gradient(self.q, self.times, axis=0)
         begin, end, mean = slopes[:-1], slopes[1:], np.diff(self.q, axis=0) / h
         bend = (begin + end - 2 * mean) / h
@@ -75,7 +75,7 @@ class Progress:
 
     @property
     def q(self) -> Array:
-        """(6,) undisturbed posture now, rad."""
+        """(n,) undisturbed posture now, rad."""
         return self.course.at(self.clock)
 
     @property
@@ -85,7 +85,7 @@ class Progress:
 
     @property
     def ahead(self) -> Array:
-        """(K, 6) undisturbed postures from now on, rad."""
+        """(K, n) undisturbed postures from now on, rad."""
         return self.course.after(self.clock)
 
     @property
@@ -114,7 +114,7 @@ def towards(
     Args:
         system: of the end effector.
         section: the postures on which it is followed.
-        q: (6,) where the robot is, rad.
+        q: (n,) where the robot is, rad.
         state: (k,) in which the hand is.
         settings: τ, and how a course is sampled.
         z: (k,) base coordinates to begin from; None are those of the state.
@@ -144,13 +144,13 @@ def towards(
 
 
 def resting(robot: Robot, q: Array) -> Course:
-    """Stay at a posture (6,)."""
+    """Stay at a posture (n,)."""
     joints = np.stack([q, q])
     return Course(np.array([0.0, 1e-2]), joints, robot.end_effector(joints))
 
 
 def straight_to(place: Array, section: Section, q: Array, limits: JointLimits, speed: float) -> Course:
-    """Take the hand from a posture (6,) straight to a place (3,), metres, at a speed, m/s."""
+    """Take the hand from a posture (n,) straight to a place (3,), metres, at a speed, m/s."""
     robot = section.robot
     begin = robot.end_effector(q)
     u = np.linspace(0, 1, 2 + int(np.linalg.norm(place - begin) / 0.02))  # a sample every 2 cm
@@ -161,7 +161,7 @@ def straight_to(place: Array, section: Section, q: Array, limits: JointLimits, s
 
 
 def shoved(progress: Progress, robot: Robot, end: Array, seconds: float) -> Course:
-    """Go on for some seconds, and meanwhile be displaced from the posture now to another one (6,)."""
+    """Go on for some seconds, and meanwhile be displaced from the posture now to another one (n,)."""
     u = np.linspace(0, 1, 9)
     goes_on = np.stack([progress.course.at(progress.clock + progress.rate * t) for t in seconds * u])
     joints = goes_on + (u * u * (3 - 2 * u))[:, None] * (end - progress.q)

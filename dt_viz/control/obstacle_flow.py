@@ -28,7 +28,7 @@ class ObstacleFlow:
         """Whether something has changed since the flow was made."""
         self._clearing, self._duration, self._made = Clearing(), 0.0, -np.inf
         self._image: tuple[tuple[Course, Clearing, float, float], Array] | None = None
-        """Course, flow, its duration, and time of the course, and the robot's posture (6,) for these, rad."""
+        """Course, flow, its duration, and time of the course, and the robot's posture (n,) for these, rad."""
 
     def see(self, avoidance: ArmAvoidance | None) -> None:
         """Take note of where the obstacles are now."""
@@ -66,7 +66,7 @@ class ObstacleFlow:
         self._duration += min(max(rise, -settings.easing * dt), 2 * settings.easing * dt)
 
     def image(self, progress: Progress) -> Array:
-        """Find the posture (6,), rad, where the robot is to be."""
+        """Find the posture (n,), rad, where the robot is to be."""
         key = progress.course, self._clearing, self._duration, progress.clock
         if self._image is None or self._image[0] != key:
             q = progress.q

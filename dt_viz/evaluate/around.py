@@ -17,7 +17,7 @@ the arm follows it. The npz file holds for each place with N obstacles and R sta
 ``hand``, ``arm``, ``hand_without``, ``arm_without``, ``frechet``, … (K, R)
     the fields of `Rollout`; NaN where there is no motion.
 
-With ``--obstacle`` it also holds of each rollout i ``q_i`` (T, 6), rad, continuous joints unwrapped, ``times_i`` (T,),
+With ``--obstacle`` it also holds of each rollout i ``q_i`` (T, n), rad, continuous joints unwrapped, ``times_i`` (T,),
 seconds, ``x_i`` (T, 3), the end effector at these, and ``demo_i`` (T_i, 3), its demonstration, metres.
 """
 

@@ -66,7 +66,7 @@ class CrossingSettings:
     box: tuple[float, float, float] = (1.0, 0.8, 0.6)
     """Sides of a box, in diameters."""
     pedestal_room: float = 0.10
-    """Distance that a path keeps from the base and link 1, which no joint moves out of its way."""
+    """Distance that a path keeps from the base and the first links, which no joint moves out of its way."""
     table_room: float = 0.01
     """Height of the obstacle above the table."""
     start_room: float = 0.05

@@ -290,7 +290,7 @@ def measure(robot: Robot, x: Array, t: Array, q: Array, demonstration: Array, go
 
 
 def joints_along(problem: Problem, plan: Plan) -> tuple[Array, ...]:
-    """The arm's postures (N_i, 6), rad, along a plan: its own, or those that track its paths, as the demonstrations."""
+    """The arm's postures (N_i, n), rad, along a plan: its own, or those that track its paths, as the demonstrations."""
     if plan.joints is not None:
         return plan.joints
     return tuple(

@@ -21,7 +21,7 @@ MARGIN = 0.03
 
 
 def run(motion: dt.Motion, arm: dt.Arm, seconds: float = 12.0) -> tuple[np.ndarray, np.ndarray]:
-    """Joint angles (T, 6), rad, and places (T, 3) of the ball, metres, at all commands."""
+    """Joint angles (T, n), rad, and places (T, 3) of the ball, metres, at all commands."""
     controller = dt.Controller(motion, arm)
     q = arm.follow(motion.rollouts()[0]).q[0]
     joints, places = [], []

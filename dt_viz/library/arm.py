@@ -25,7 +25,7 @@ class JointPath:
     """A motion of the arm's joints."""
 
     q: Array
-    """(T, 6) joint angles, rad; continuous joints unwrapped."""
+    """(T, n) joint angles, rad; continuous joints unwrapped."""
     times: Array
     """(T,) seconds, later than the path's where the joints' velocity limits ask for it."""
     error: Array
@@ -37,7 +37,7 @@ class BlockedError(Exception):
 
 
 class Arm:
-    """The JACO arm."""
+    """A robot arm."""
 
     def __init__(self, robot: Robot) -> None:
         """Wrap a robot; see `load_jaco`."""

@@ -1,1 +1,1 @@
-"""The JACO: kinematics, tracking, configuration space and collision."""
+"""An arm: kinematics, shapes, inverse kinematics, tracking and collision."""

@@ -28,8 +28,8 @@ def within_velocity_limits(times: Array, q: Array, limits: Array) -> Array:
 
     Args:
         times: (T,) seconds, not decreasing.
-        q: (T, 6) joint angles, rad; those of continuous joints unwrapped.
-        limits: (6,) rad/s, greater than 0.
+        q: (T, n) joint angles, rad; those of continuous joints unwrapped.
+        limits: (n,) rad/s, greater than 0.
 
     Returns:
         (T,) seconds, from the same start: no interval is shorter than before, and in none is a joint's mean speed above
@@ -62,5 +62,5 @@ def within_velocity_limits(times: Array, q: Array, limits: Array) -> Array:
 
 
 def _least_intervals(q: Array, limits: Array) -> Array:
-    """Return the shortest duration (T − 1,) of each segment of q (T, 6), at a joint's limit, seconds."""
+    """Return the shortest duration (T − 1,) of each segment of q (T, n), at a joint's limit, seconds."""
     return (np.abs(np.diff(q, axis=0)) / limits).max(axis=1)

@@ -170,7 +170,7 @@ class Drawing:
 
     @kept(2, by=lambda frame, near: (frame.motion.scenario.task, frame.scenario.view.slice, near.tobytes()))
     def _postures(self, frame: Frame, near: Array) -> Lattice:
-        """The postures that hold the hand at the lattice, `near` one (6,), rad."""
+        """The postures that hold the hand at the lattice, `near` one (n,), rad."""
         return Lattice.of(lattice(frame), self._follower.robot, near)
 
     @kept(2, by=_stacked)

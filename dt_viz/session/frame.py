@@ -64,7 +64,7 @@ class Compared:
     times: tuple[Array, ...] = ()
     """(N_i,) of their samples, seconds."""
     joints: tuple[Array, ...] | None = None
-    """(N_i, 6) of the arm, rad, where the method plans them."""
+    """(N_i, n) of the arm, rad, where the method plans them."""
     scores: Scores | None = None
     note: str = ""
     """What the motions fail at, or why there are none."""

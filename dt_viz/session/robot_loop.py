@@ -79,12 +79,12 @@ class LiveArm:
 
     @property
     def q(self) -> Array | None:
-        """Its joint angles (6,), rad; None before it has something to follow."""
+        """Its joint angles (n,), rad; None before it has something to follow."""
         return self._q
 
     @property
     def undisturbed(self) -> Array | None:
-        """The joint angles (6,), rad, at this moment of the motion without what is stacked on the learned one."""
+        """The joint angles (n,), rad, at this moment of the motion without what is stacked on the learned one."""
         controller = self._controller
         return None if controller is None else controller.undisturbed
 
@@ -176,7 +176,7 @@ class LiveArm:
         self._controller = self._solved = None
 
     def put(self, q: Array) -> None:
-        """Begin anew at joint angles q (6,), rad: somebody else has moved the robot there."""
+        """Begin anew at joint angles q (n,), rad: somebody else has moved the robot there."""
         with self._changing:
             self._q = q
 
@@ -281,7 +281,7 @@ class LiveArm:
 
 
 def _posture(follower: Follower, solved: Solved, rollout: int) -> Array:
-    """The joint angles (6,) at the beginning of a rollout, rad."""
+    """The joint angles (n,) at the beginning of a rollout, rad."""
     if solved.arm is not None:
         return solved.arm.p[int(np.argmax(solved.arm.index == rollout))]
     return follower.undisturbed(solved.nominal).tracked.q[rollout, 0]

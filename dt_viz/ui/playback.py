@@ -48,7 +48,7 @@ class Replay:
 
     @property
     def q(self) -> Array | None:
-        """Joint angles (6,) now, rad; None before there is a motion."""
+        """Joint angles (n,) now, rad; None before there is a motion."""
         motion = self.motion
         return None if motion is None else self._now(motion, motion.q)
 
@@ -78,7 +78,7 @@ class Playback:
         """
         self.live, self.replay = live, Replay()
         self.arm: LiveArm | Replay = live
-        """What moves now, with its joint angles `q` and `undisturbed`, (6,), rad, and the time since it `arrived`."""
+        """What moves now, with its joint angles `q` and `undisturbed`, (n,), rad, and the time since it `arrived`."""
         self._draw = draw
         self._playing, self._speed = True, 1.0
 

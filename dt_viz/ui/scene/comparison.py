@@ -102,7 +102,7 @@ class TheirArm:
         self._ghost.visible = shown and self._replay.motion is not None
 
     def pose(self, now: float, q: Array, speed: float, *, sets_out: bool) -> None:
-        """Go on to a moment, seconds, at a speed relative to real time, beside our arm at `q` (6,), rad."""
+        """Go on to a moment, seconds, at a speed relative to real time, beside our arm at `q` (n,), rad."""
         before, self._seen = self._seen, now
         if not self._ghost.visible:
             return

@@ -1,0 +1,115 @@
+"""Arms of five and seven joints: kinematics, avoidance, joint paths and the loop, beside each other in one process."""
+
+# pyright: reportAttributeAccessIssue=false
+# (pinocchio has no stubs)
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin  # noqa: TID251, here it is the oracle
+import pytest
+from other_arms import MORE, OTHER_ARMS, five_joints, seven_joints
+from pinocchio_arm import random_configurations
+from scenes import avoiding
+
+from dt_viz.control.controller import ArmController, Phase
+from dt_viz.memo import Memo
+from dt_viz.motion.stack import FINE
+from dt_viz.obstacles.shapes import Sphere, as_point
+from dt_viz.robot.inverse_kinematics import inverse_kinematics, track
+from dt_viz.robot.robot import Robot
+from dt_viz.scenario.tasks import TASKS
+from dt_viz.session.engine import Engine
+from dt_viz.session.frame import Stage
+
+
+@pytest.fixture(scope="module", params=OTHER_ARMS)
+def arm(request) -> Robot:
+    return OTHER_ARMS[request.param]()
+
+
+def as_pinocchio(arm: Robot) -> tuple:
+    """The same chain in pinocchio, and its frame at the end effector."""
+    model, last = pin.Model(), 0
+    for turn, shift, name in zip(arm.joint_rotations, arm.joint_translations, arm.joint_names, strict=True):
+        last = model.addJoint(last, pin.JointModelRZ(), pin.SE3(turn, shift), name)
+    hand = pin.Frame("hand", last, pin.SE3(np.eye(3), arm.end_effector_offset), pin.FrameType.OP_FRAME)
+    index = model.addFrame(hand)
+    return model, model.createData(), index
+
+
+class TestKinematics:
+    def test_places_and_their_derivatives_are_those_of_pinocchio(self, arm):
+        model, data, hand = as_pinocchio(arm)
+        for q in random_configurations(arm, 0, (20,)):
+            rotations, origins = arm.forward_kinematics(q)
+            expected = pin.computeFrameJacobian(model, data, q, hand, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
+            np.testing.assert_allclose(arm.jacobian(q), expected[:3], atol=1e-12)
+            pin.framesForwardKinematics(model, data, q)
+            np.testing.assert_allclose(arm.end_effector(q), data.oMf[hand].translation, atol=1e-12)
+            np.testing.assert_allclose(rotations[-1], data.oMi[arm.num_joints].rotation, atol=1e-12)
+            np.testing.assert_allclose(origins[-1], data.oMi[arm.num_joints].translation, atol=1e-12)
+            axis = data.oMi[arm.num_joints].rotation @ arm.hand_axis
+            np.testing.assert_allclose(arm.hand_direction(q), axis / np.linalg.norm(axis), atol=1e-12)
+
+    def test_where_their_joints_are_at_zero_they_stand_as_the_jaco(self, robot):
+        q = random_configurations(robot, 1, (20,))
+        q[:, -1] = 0
+        places = robot.body.positions(robot, q)
+        for arm, same in ((five_joints(), q[:, :-1]), (seven_joints(), np.insert(q, MORE, 0.0, axis=1))):
+            np.testing.assert_allclose(arm.end_effector(same), robot.end_effector(q), atol=1e-12)
+            np.testing.assert_allclose(arm.hand_direction(same), robot.hand_direction(q), atol=1e-12)
+            np.testing.assert_allclose(arm.body.positions(arm, same), places, atol=1e-12)
+
+    def test_a_path_is_followed_on_one_branch(self, arm):
+        u = np.linspace(0, 2 * np.pi, 200)
+        path = np.array([0.0, -0.5, 0.35]) + 0.12 * np.stack([np.sin(u), 0.3 * np.cos(u), np.sin(2 * u)], axis=1)
+        followed = track(arm, path, inverse_kinematics(arm, path[0]))
+        assert followed.q.shape == (200, arm.num_joints)
+        assert followed.error.max() < 1e-5 and not followed.limits_hit.any()
+        assert np.abs(np.diff(followed.q, axis=0)).max() < 0.2
+        np.testing.assert_allclose(followed.q[-1], followed.q[0], atol=1e-3)
+
+    @pytest.mark.parametrize("num", [2, 9])
+    def test_an_arm_with_too_few_or_too_many_joints_is_refused(self, robot, num):
+        with pytest.raises(ValueError, match=f"jaco: found {num} joints; accepted: 3 to 8"):
+            replace(robot, joint_translations=np.zeros((num, 3)))
+
+
+class TestAvoidance:
+    def test_the_whole_arm_clears_a_ball_and_the_loop_takes_it_to_the_goal(self, arm, fits):
+        engine = Engine(TASKS, fits, arm)
+        task = engine.task("push_box")
+        middle = task.mean_path[len(task.mean_path) // 2]
+        ball = Sphere(as_point(np.add(middle, (0.0, 0.0, 0.06))), 0.1)
+        scenario = avoiding("push_box", ball, space="cspace", margin=0.01)
+        frame = next(frame for frame in engine.frames(scenario) if frame.stage is Stage.CERTIFIED)
+        assert not frame.blocked and frame.motion.arm.cleared
+        q = frame.arm.q
+        assert q.shape[1] == arm.num_joints and ((q >= arm.lower) & (q <= arm.upper)).all()
+        assert arm.collision.nearest_to_obstacle(frame.arm.without, ball).distance < 0  # it was in the way
+        assert frame.certificates.collision.obstacle.distance > 0.009
+        assert np.linalg.norm(arm.end_effector(q[-1]) - frame.goal) < 1e-3
+        speeds = np.abs(np.diff(q, axis=0)) / np.diff(frame.arm.times)[:, None]
+        assert (speeds <= arm.velocity_limits * (1 + 1e-6)).all()
+
+        controller, passed = ArmController(engine.follower, engine.solved(scenario, FINE)), [q[0]]
+        while controller.phase is not Phase.RESTING or len(passed) < 10:
+            passed.append(passed[-1] + 0.01 * controller.step(passed[-1], 0.01))
+            assert len(passed) < 3000
+        assert np.linalg.norm(arm.end_effector(passed[-1]) - frame.goal) < 1e-3
+        assert arm.collision.nearest_to_obstacle(np.array(passed)[::5], ball).distance > 4e-3
+        with pytest.raises(ValueError, match=f"accepted: {arm.num_joints} finite angles"):
+            controller.step(np.zeros(6), 0.01)
+
+
+def test_engines_of_two_arms_share_what_is_kept_and_none_gets_what_is_the_others(robot, fits):
+    shared, found = Memo(), {}
+    scenario = avoiding("push_box", Sphere((0.1, -0.5, 0.3), 0.1), space="cspace")
+    for memo in (shared, None):
+        for arm in (robot, five_joints(), seven_joints()):
+            engine = Engine(TASKS, fits, arm, memo)
+            solved = engine.solved(scenario, FINE)
+            known = engine.follower.reference_postures(solved.nominal.learned)
+            assert known.references.shape[1] == solved.arm.p.shape[1] == arm.num_joints
+            np.testing.assert_array_equal(solved.arm.p, found.setdefault(arm.name, solved.arm.p))
