@@ -38,7 +38,7 @@ class ChoiceSettings:
     """Place of the hand at home, ahead of and above the second joint."""
     manipulability: float = 0.12
     """Manipulability at home above which more is no better, in reach³."""
-    least_manipulability: float = 0.02
+    least_manipulability: float = 0.05
     """Manipulability below which a home of the SRDF is not taken, in reach³."""
     least_ahead: float = 0.25
     """Distance of the hand ahead of the base below which a home of the SRDF is not taken."""
