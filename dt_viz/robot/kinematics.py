@@ -91,7 +91,7 @@ class Kinematics:
 
     def reaches(self, places: ArrayLike) -> NDArray[np.bool_]:
         """Return which (*B,) of some places (*B, 3), metres, the hand gets to, about."""
-        return np.linalg.norm(places - self.shoulder, axis=-1) <= self.working_radius
+        return np.linalg.norm(np.subtract(places, self.shoulder), axis=-1) <= self.working_radius
 
     @cached_property
     def records(self) -> NDArray[np.void]:

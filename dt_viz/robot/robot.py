@@ -115,8 +115,9 @@ class Robot(Kinematics):
     def tracking_arm(self) -> TrackingArm:
         """The arm for the compiled loops of tracking."""
         arrays = (self.end_effector_offset, self.hand_axis, self.lower, self.upper)
-        weights = (getattr(self.sized_tracking, name) for name in TrackingArm._fields[1 + len(arrays) :])
-        return TrackingArm(self.records, *map(np.array, arrays), *weights)
+        hand, axis, lower, upper = (np.array(values) for values in arrays)
+        weights = (getattr(self.sized_tracking, name) for name in TrackingArm._fields[5:])
+        return TrackingArm(self.records, hand, axis, lower, upper, *weights)
 
     @cached_property
     def top_speed(self) -> float:
@@ -146,7 +147,8 @@ class Robot(Kinematics):
         It is too small by twice `PROTRUSION` at most, and at most `enough`.
         """
         pairs = self.pairs(between=2)
-        return float(least_contacts(self.records, self.body.spheres, pairs, np.array(q, order="C"), enough).min())
+        apart = least_contacts(self.records, self.body.spheres, pairs, np.array(q, order="C"), enough)
+        return float(apart.min(initial=enough))
 
     def clip(self, q: ArrayLike) -> Array:
         """Return the nearest configuration inside the joint limits; q (*B, n), rad."""

@@ -65,7 +65,7 @@ class Visitor(Display):
         with client.atomic():
             self.pictures = ScenePictures(client.scene, robot, lambda: self.session)
             self.robot = RobotScene(client, robot, Playback(engine.arm, self._pose))
-        self._camera = CameraController(client, lambda: self.robot.hand)
+        self._camera = CameraController(client, lambda: self.robot.hand, robot.size)
         self._panel = ControlPanel(
             client.gui, titles, robot, self._save_png, partial(notify, client), self._camera, self._darken
         )

@@ -43,7 +43,7 @@ def solids() -> tuple[trimesh.Trimesh, ...]:
 
 
 def some_configurations(seed: int, num: int) -> np.ndarray:
-    return random_configurations(load_jaco().collision.robot, seed, (num,))
+    return random_configurations(load_jaco(), seed, (num,))
 
 
 def random_path(seed: int, num: int = 12) -> np.ndarray:

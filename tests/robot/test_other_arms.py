@@ -84,13 +84,15 @@ class TestAvoidance:
         ball = Sphere(as_point(np.add(middle, (0.0, 0.0, 0.06))), 0.1)
         scenario = avoiding("push_box", ball, space="cspace", margin=0.01)
         frame = next(frame for frame in engine.frames(scenario) if frame.stage is Stage.CERTIFIED)
-        assert not frame.blocked and frame.motion.arm.cleared
-        q = frame.arm.q
+        motion, report = frame.arm, frame.certificates.collision
+        assert not frame.blocked and frame.motion.arm is not None and motion is not None and report is not None
+        assert frame.motion.arm.cleared
+        q = motion.q
         assert q.shape[1] == arm.num_joints and ((q >= arm.lower) & (q <= arm.upper)).all()
-        assert arm.collision.nearest_to_obstacle(frame.arm.without, ball).distance < 0  # it was in the way
-        assert frame.certificates.collision.obstacle.distance > 0.009
+        assert arm.collision.nearest_to_obstacle(motion.without, ball).distance < 0  # it was in the way
+        assert report.obstacle.distance > 0.009
         assert np.linalg.norm(arm.end_effector(q[-1]) - frame.goal) < 1e-3
-        speeds = np.abs(np.diff(q, axis=0)) / np.diff(frame.arm.times)[:, None]
+        speeds = np.abs(np.diff(q, axis=0)) / np.diff(motion.times)[:, None]
         assert (speeds <= arm.velocity_limits * (1 + 1e-6)).all()
 
         controller, passed = ArmController(engine.follower, engine.solved(scenario, FINE)), [q[0]]
@@ -111,5 +113,6 @@ def test_engines_of_two_arms_share_what_is_kept_and_none_gets_what_is_the_others
             engine = Engine(TASKS, fits, arm, memo)
             solved = engine.solved(scenario, FINE)
             known = engine.follower.reference_postures(solved.nominal.learned)
+            assert solved.arm is not None
             assert known.references.shape[1] == solved.arm.p.shape[1] == arm.num_joints
             np.testing.assert_array_equal(solved.arm.p, found.setdefault(arm.name, solved.arm.p))

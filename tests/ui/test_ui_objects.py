@@ -17,7 +17,7 @@ class Carrying:
     """What is carried, and the hand that carries it."""
 
     def __init__(self, scene):
-        self._carried = Carried(scene, "/hand", ROBOT.end_effector_offset)
+        self._carried = Carried(scene, "/hand", ROBOT.end_effector_offset, ROBOT.hand_axis)
         self.objects, self.drawing = self._carried.objects, self._carried.drawing
         self.stand, self.show = self._carried.stand, self._carried.show
 

@@ -55,6 +55,8 @@ class Framing:
     """Part of the free window that stays empty on each side."""
     field_of_view: float = 0.75
     """Vertical field of view, rad."""
+    arm_size: float = 1.0
+    """Reach of the arm that is to be seen, relative to the JACO's."""
 
     @property
     def free(self) -> tuple[Array, Array]:
@@ -106,7 +108,7 @@ def view_of(
         hand: (3,) where the hand is, metres; without it the view of the hand is that of the task.
     """
     position, look_at = (np.asarray(place) for place in task.camera)
-    direction, places = look_at - position, places_of(task)
+    direction, places = look_at - position, places_of(task, framing.arm_size)
     if view == HAND and hand is not None:
         places = hand + _around(0.15)
     elif panels:
@@ -116,11 +118,13 @@ def view_of(
     return framed(places, np.asarray(VIEWS.get(view, direction)), *framing.free)
 
 
-def places_of(task: Task) -> Array:
-    """Return the places (N, 3) that are to be seen of a task, metres: its motions, its objects, and the arm there."""
+def places_of(task: Task, arm_size: float = 1.0) -> Array:
+    """Return the places (N, 3) that are to be seen of a task, metres: its motions, its objects, and an arm there."""
     paths = np.concatenate(task.paths)
-    wrist = paths + np.array([0.0, 0.08, 0.12])
-    base_to_elbow = np.array([(-0.10, -0.10, 0.0), (0.10, 0.10, 0.0), (-0.08, -0.12, 0.80), (0.08, 0.0, 0.80)])
+    wrist = paths + arm_size * np.array([0.0, 0.08, 0.12])
+    base_to_elbow = arm_size * np.array(
+        [(-0.10, -0.10, 0.0), (0.10, 0.10, 0.0), (-0.08, -0.12, 0.80), (0.08, 0.0, 0.80)]
+    )
     obstacle = np.asarray(task.obstacle_position) + _around(0.09)
     pots = [pot.surface()[0] + (pot.x, pot.y, 0.0) for pot in task.pots]
     objects = [thing.surface()[0] + thing.start for thing in task.objects if thing.start is not None]
@@ -182,12 +186,13 @@ class CameraController:
     Where the visitor moves the camera, the orbit waits, and goes on from there; while it is locked, it is put back.
     """
 
-    def __init__(self, client: viser.ClientHandle, hand: Callable[[], Array | None]) -> None:
+    def __init__(self, client: viser.ClientHandle, hand: Callable[[], Array | None], arm_size: float = 1.0) -> None:
         """Take over the camera of a visitor, and leave it where it is until `look`.
 
         Args:
             client: connection of the visitor.
             hand: says where the hand is, (3,), metres, if it is anywhere.
+            arm_size: reach of the arm, relative to the JACO's.
         """
         self.locked = self.orbits = False
         """Whether the camera is put back where a visitor moves it, and turns slowly around what it shows."""
@@ -197,7 +202,7 @@ class CameraController:
         """Poses that the camera was given since it took another view, the newest last: a browser reports late."""
         self._chosen: Pose | None = None
         """Pose that the visitor has moved the camera to; None if it stands where it was put."""
-        self._framing = Framing()
+        self._framing = Framing(arm_size=arm_size)
         """The framing of the current view."""
         self._width: float | None = None
         self._shown: tuple[Task, Sequence[Slice], str] | None = None

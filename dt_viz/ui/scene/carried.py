@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import viser
+from scipy.spatial.transform import Rotation
 
 from dt_viz.flows.fields import Array
 from dt_viz.obstacles.shapes import lathe
@@ -80,13 +81,14 @@ INK_PERIOD = 0.12
 class Drawing:
     """Board, pen and ink of a task that draws."""
 
-    def __init__(self, scene: viser.SceneApi, hand: str, tip: Array) -> None:
+    def __init__(self, scene: viser.SceneApi, hand: str, tip: Array, axis: Array) -> None:
         """Make them, hidden.
 
         Args:
             scene: scene of the visitor.
             hand: name of the hand in the scene tree.
-            tip: (3,) where the end effector is, in the hand's frame, metres; the pen's axis leads there.
+            tip: (3,) where the end effector is, in the hand's frame, metres.
+            axis: (3,) direction of the hand, and of the pen to its tip, in that frame.
         """
         self._board = scene.add_mesh_simple(
             "/board",
@@ -101,9 +103,13 @@ class Drawing:
         )
         # distances from the pen's axis and from its tip, metres
         vertices, faces = lathe(((0.0, 0.0), (0.0055, 0.022), (0.0075, 0.028), (0.0075, 0.15), (0.0, 0.15)), 24)
-        if tip[2] > 0:
-            vertices = vertices * [1.0, -1.0, -1.0]  # turned about x: towards the hand
-        self._pen = scene.add_mesh_simple(f"{hand}/pen", tip + vertices, faces, color=LIGHT.ink, visible=False)
+        back = -axis / np.linalg.norm(axis)
+        across = np.array([-back[1], back[0], 0.0])  # z × back
+        slope = float(np.linalg.norm(across))
+        turn = Rotation.from_rotvec(np.arctan2(slope, back[2]) * (across / slope if slope > 1e-9 else np.eye(3)[0]))
+        self._pen = scene.add_mesh_simple(
+            f"{hand}/pen", tip + turn.apply(vertices), faces, color=LIGHT.ink, visible=False
+        )
         self.ink = Lines(scene, "/ink", STYLES.ink)
         self._arm = True
         self._area: Slice | None = None
@@ -151,9 +157,9 @@ class Drawing:
 class Carried:
     """What the hand carries, and what it draws: all begins anew when the hand sets out from a start."""
 
-    def __init__(self, scene: viser.SceneApi, node: str, tip: Array) -> None:
-        """Begin with nothing; `tip` (3,), metres, is where the end effector is in the frame of the hand's node."""
-        self.objects, self.drawing = Objects(scene), Drawing(scene, node, tip)
+    def __init__(self, scene: viser.SceneApi, node: str, tip: Array, axis: Array) -> None:
+        """Begin with nothing; see `Drawing`."""
+        self.objects, self.drawing = Objects(scene), Drawing(scene, node, tip, axis)
         self._task: Task | None = None
         self._hand: Hand | None = None
         """Where the hand was last; None before it moves in this task."""

@@ -29,7 +29,7 @@ class RobotScene:
         self._client, self._robot, self.playback = client, robot, playback
         self.arms, self.their_arm = Arms(scene, robot), TheirArm(scene, robot)
         node = self.arms.arm.frames[-1].name
-        self.carried = Carried(scene, node, robot.end_effector_offset)
+        self.carried = Carried(scene, node, robot.end_effector_offset, robot.hand_axis)
         self.path = HandPath(scene)
         self.grip = Grip(scene, robot, node, lambda: self.hand, self._hold)
         self._view, self._theme = View(), LIGHT
