@@ -135,7 +135,7 @@ def count_fixed(kinematics: Kinematics) -> tuple[int, str]:
 
 
 def find_touching(
-    kinematics: Kinematics,
+    solids: CollisionModel,
     meshes: Sequence[LinkMesh],
     ranges: Ranges,
     semantic: Element | None,
@@ -153,7 +153,7 @@ def find_touching(
         frozenset((str(pair.get("link1")), str(pair.get("link2")))) for pair in told if pair.get("reason") != "Never"
     }
     named = {frozenset(pair) for pair in apart} & excepted
-    measure = BetweenLinks(CollisionModel(kinematics, meshes, 0).links, frozenset(named))
+    kinematics, measure = solids.robot, BetweenLinks(solids.links, frozenset(named))
     near, names = settings.near * kinematics.reach, [mesh.name for mesh in meshes]
     pairs = [
         pair for pair in combinations(range(len(meshes)), 2) if frozenset((names[pair[0]], names[pair[1]])) not in named

@@ -294,14 +294,15 @@ def _clusterings(
 
 def bounding_sphere(spheres: Spheres) -> Array:
     """Find the smallest sphere (4,) around others, about: its centre steps to the farthest (Bădoiu and Clarkson)."""
-    centre = spheres[:, :3].mean(axis=0)
+    centres, radii = np.array(spheres[:, :3]), spheres[:, 3]
+    centre = centres.mean(axis=0)
     for step in range(2, 100):
-        farthest = (np.linalg.norm(spheres[:, :3] - centre, axis=1) + spheres[:, 3]).argmax()
-        way = spheres[farthest, :3] - centre
-        length = np.linalg.norm(way)
-        if length:
-            centre = centre + way * (1 + spheres[farthest, 3] / length) / step
-    return np.append(centre, (np.linalg.norm(spheres[:, :3] - centre, axis=1) + spheres[:, 3]).max())
+        away = centres - centre
+        lengths = np.sqrt(np.add.reduce(away * away, axis=1))
+        farthest = (lengths + radii).argmax()
+        if lengths[farthest]:
+            centre = centre + away[farthest] * (1 + radii[farthest] / lengths[farthest]) / step
+    return np.append(centre, (np.linalg.norm(centres - centre, axis=1) + radii).max())
 
 
 def _tree(spheres: Spheres, num_leaves: int) -> tuple[Spheres, Indices]:

@@ -316,6 +316,7 @@ class _Given:
             base = to_front(front)
             arm, meshes, visuals = _turned(shapes, base)
             num_fixed, fixed_why = count_fixed(arm)
+            solids = CollisionModel(arm, meshes, num_fixed)
             cover_why = "as shipped"
             if body is None:
                 body = BodyPoints(
@@ -331,11 +332,11 @@ class _Given:
                     f"they stick out of the meshes by {1e3 * mean:.1f} mm in the mean, {1e3 * most:.0f} mm at most"
                 )
                 tell(0.75, "looking for links that always touch")
-                touching, touching_why = find_touching(arm, meshes, ranges, semantic, self.choice)
+                touching, touching_why = find_touching(solids, meshes, ranges, semantic, self.choice)
             else:
                 touching, touching_why = frozenset(), "neighbours alone"
             tell(0.85, "looking for a ready pose")
-            solids = CollisionModel(arm, meshes, num_fixed, touching)
+            solids.touching = touching
             search = HomeSearch(arm, body, solids, ranges, self.choice)
             names = tuple(joint.name for joint in chain.joints)
             posture, home_why = find_home(search, names, lower, upper, home, semantic)
