@@ -8,12 +8,21 @@ from pathlib import Path
 import numpy as np
 
 from dt_viz.kernels.arm import BODY_POINT
+from dt_viz.robot.body_points import PROTRUSION
 from dt_viz.robot.cover import CoverSettings, covering_tree
 from dt_viz.robot.meshes import LinkMesh
 from dt_viz.robot.models import load_jaco
 
 FILE = Path(__file__).parent / "body_points.npz"
-SETTINGS = CoverSettings(spacing=1.5e-3, fine_spacing=1.5e-3, inner_spacing=4e-3, closing=0.0, num_starts=4, rounds=40)
+SETTINGS = CoverSettings(
+    protrusion=PROTRUSION,
+    spacing=1.5e-3,
+    fine_spacing=1.5e-3,
+    inner_spacing=4e-3,
+    closing=0.0,
+    num_starts=4,
+    rounds=40,
+)
 MAX_RADIUS = 0.058  # metres, of a body point: the upper links are 0.041 thick
 MAX_HAND_RADIUS = 0.052  # of what is near the end effector, which tight spheres let pass closer
 MAX_FINGER_RADIUS = 0.033

@@ -42,7 +42,7 @@ class CoverSettings:
     """Distance by which the smallest spheres stick out of a link, metres."""
     spacing: float = 3e-3
     """Spacing of the points on the surface that spheres are chosen for, metres."""
-    fine_spacing: float = 2e-3
+    fine_spacing: float = 1.5e-3
     """Spacing of the points on the surface that their radii hold, metres."""
     inner_spacing: float = 4.5e-3
     """Spacing of the candidates in a link, metres."""
@@ -197,8 +197,7 @@ def _fitted(centres: Array, radii: Array, points: Array, slack: float) -> Sphere
         own = (away - radii[near]).argmin(axis=1)
         np.maximum.at(needed, near[own], away[np.arange(len(some)), own])
     kept = needed > 0
-    fitted = np.where(needed < radii, np.minimum(radii, needed + slack), needed + slack)
-    return np.column_stack([centres, fitted])[kept]
+    return np.column_stack([centres, needed + slack])[kept]
 
 
 def _on_surface(mesh: LinkMesh, spacing: float) -> Array:
@@ -295,13 +294,13 @@ def _clusterings(
 def bounding_sphere(spheres: Spheres) -> Array:
     """Find the smallest sphere (4,) around others, about: its centre steps to the farthest (Bădoiu and Clarkson)."""
     centres, radii = np.array(spheres[:, :3]), spheres[:, 3]
-    centre = centres.mean(axis=0)
+    centre = spheres[:, :3].mean(axis=0)
     for step in range(2, 100):
         away = centres - centre
-        lengths = np.sqrt(np.add.reduce(away * away, axis=1))
-        farthest = (lengths + radii).argmax()
-        if lengths[farthest]:
-            centre = centre + away[farthest] * (1 + radii[farthest] / lengths[farthest]) / step
+        farthest = (np.sqrt(np.add.reduce(away * away, axis=1)) + radii).argmax()
+        length = np.linalg.norm(away[farthest])
+        if length:
+            centre = centre + away[farthest] * (1 + radii[farthest] / length) / step
     return np.append(centre, (np.linalg.norm(centres - centre, axis=1) + radii).max())
 
 
