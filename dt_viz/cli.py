@@ -54,7 +54,7 @@ def _serve(options: argparse.Namespace) -> int:
     from dt_viz.folders import default_cache_folder  # noqa: PLC0415
     from dt_viz.learning.imitation import ImitationError  # noqa: PLC0415
     from dt_viz.learning.store import FitStore  # noqa: PLC0415
-    from dt_viz.robot.robot import load_jaco  # noqa: PLC0415
+    from dt_viz.robot.models import load_jaco  # noqa: PLC0415
     from dt_viz.scenario.tasks import known_tasks  # noqa: PLC0415
     from dt_viz.ui.patches import GateError  # noqa: PLC0415
     from dt_viz.ui.server import AddressError, Server  # noqa: PLC0415

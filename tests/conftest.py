@@ -33,7 +33,8 @@ from scenes import avoiding, frame_at
 from dt_viz.avoidance.arm import WholeArm
 from dt_viz.learning.store import FitStore
 from dt_viz.obstacles.shapes import Sphere
-from dt_viz.robot.robot import Robot, load_jaco
+from dt_viz.robot.models import load_jaco
+from dt_viz.robot.robot import Robot
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.engine import Engine
 

@@ -20,7 +20,7 @@ from dt_viz.flows.diffeomorphisms import Integration
 from dt_viz.learning.imitation import Imitation, fit
 from dt_viz.learning.store import FitStore, fingerprint
 from dt_viz.obstacles.shapes import Box, Cylinder, Sphere
-from dt_viz.robot.robot import load_jaco
+from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.stack import plane_of
 from dt_viz.scenario.tasks import TASKS

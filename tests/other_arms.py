@@ -7,7 +7,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dt_viz.robot.body_points import BodyPoints
-from dt_viz.robot.robot import Robot, load_jaco
+from dt_viz.robot.models import load_jaco
+from dt_viz.robot.robot import Robot
 
 MORE = 3
 """Index of the joint that is inserted."""

@@ -18,7 +18,7 @@ from dt_viz.flows.diffeomorphisms import Integration
 from dt_viz.motion.certificates import Certificates
 from dt_viz.motion.following import Follower
 from dt_viz.obstacles.shapes import Box, Cylinder, Sphere, rotation
-from dt_viz.robot.robot import load_jaco
+from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.engine import Engine

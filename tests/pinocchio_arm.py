@@ -8,7 +8,8 @@ from functools import lru_cache
 import numpy as np
 import pinocchio as pin  # noqa: TID251, here it is the oracle
 
-from dt_viz.robot.robot import Robot, load_jaco
+from dt_viz.robot.models import load_jaco
+from dt_viz.robot.robot import Robot
 
 
 def random_configurations(robot: Robot, seed: int, shape: tuple[int, ...]) -> np.ndarray:

@@ -42,7 +42,7 @@ MAY_IMPORT: Mapping[str, set[str]] = {
 }
 """The packages from the bottom up, and which of those below each may import."""
 ONLY_IMPORTERS: Mapping[str, set[str]] = {
-    "pinocchio": {"robot/robot.py"},
+    "pinocchio": {"robot/link_shapes.py"},
     "coal": {"robot/link_distances.py"},
     "matplotlib": {"examples/plot.py", "evaluate/figures.py"},
     "torch": {"baselines/eflow_training.py"},

@@ -10,7 +10,7 @@ import dt_viz as dt
 from dt_viz.examples import arm_controller, controller, plot
 from dt_viz.examples.viser_scene import Scene
 from dt_viz.library.motion import Motion
-from dt_viz.robot.robot import load_jaco
+from dt_viz.robot.models import load_jaco
 from dt_viz.shipped import ASSETS
 from dt_viz.warning import Kind
 

@@ -17,7 +17,7 @@ from dt_viz.avoidance.hand import Avoidance
 from dt_viz.avoidance.registry import AVOIDANCE
 from dt_viz.folders import default_cache_folder
 from dt_viz.learning.store import FitStore
-from dt_viz.robot.robot import load_jaco
+from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.tasks import TASKS, Task, TaskEntry, known_tasks
 from dt_viz.session.engine import Engine

@@ -31,7 +31,7 @@ from dt_viz.learning.store import FitStore
 from dt_viz.motion.following import Follower
 from dt_viz.motion.nominal import Learned
 from dt_viz.obstacles.union import Union
-from dt_viz.robot.robot import load_jaco
+from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.tasks import TASKS, Task, lasa_tasks
 
 

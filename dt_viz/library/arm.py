@@ -14,9 +14,9 @@ from dt_viz.motion.following import Follower
 from dt_viz.motion.solve import Solved, solve
 from dt_viz.motion.stack import FINE, LIVE, build_stack
 from dt_viz.robot.inverse_kinematics import inverse_kinematics, track
+from dt_viz.robot.models import load_jaco as load_robot
 from dt_viz.robot.retiming import within_velocity_limits
 from dt_viz.robot.robot import Robot
-from dt_viz.robot.robot import load_jaco as load_robot
 from dt_viz.robot.tracking_settings import TrackingSettings
 
 

@@ -17,7 +17,7 @@ from dt_viz.motion.stack import FINE, LIVE
 from dt_viz.obstacles.shapes import Box, Sphere, as_point
 from dt_viz.robot.body_points import PROTRUSION
 from dt_viz.robot.inverse_kinematics import track
-from dt_viz.robot.robot import load_jaco
+from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.scenario import Scenario
 
 ELBOW = Sphere((0.04, -0.37, 0.38), 0.08)

@@ -27,7 +27,7 @@ from oracles import central_differences
 from dt_viz.avoidance.arm_field import GradientField, WholeArmField
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Flow
 from dt_viz.obstacles.shapes import Box, Sphere
-from dt_viz.robot.robot import HOME
+from dt_viz.robot.models import HOME
 
 seeds = st.integers(0, 2**32 - 1)
 ESCAPES = {name: field for name, field in ARM_FIELDS.items() if isinstance(field, WholeArmField)}

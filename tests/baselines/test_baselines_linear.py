@@ -10,7 +10,7 @@ from dt_viz.obstacles.shapes import Box, Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.inverse_kinematics import UnreachableError
 from dt_viz.robot.link_distances import Poses
-from dt_viz.robot.robot import load_jaco
+from dt_viz.robot.models import load_jaco
 
 
 def test_joints_go_straight_from_the_demonstrated_start_to_the_demonstrated_goal(problem):

@@ -25,7 +25,7 @@ from dt_viz.baselines.postures import PlanningScene
 from dt_viz.errors import UnwantedError
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
-from dt_viz.robot.robot import load_jaco
+from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.shipped import ASSETS
 

@@ -22,7 +22,7 @@ from dt_viz.control.controller import Phase
 from dt_viz.evaluate.options import InputError, add_lasa
 from dt_viz.folders import default_cache_folder
 from dt_viz.learning.store import FitStore
-from dt_viz.robot.robot import load_jaco
+from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.paper_scenes import SCENES, offered
 from dt_viz.scenario.tasks import known_tasks
 from dt_viz.session.frame import Stage

@@ -18,7 +18,7 @@ from dt_viz.evaluate.options import add_lasa, ready_to_write, report, write_json
 from dt_viz.folders import default_cache_folder
 from dt_viz.learning.store import FitStore
 from dt_viz.memo import Memo
-from dt_viz.robot.robot import load_jaco
+from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.paper_scenes import SCENES, offered
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import known_tasks

@@ -13,7 +13,7 @@ from dt_viz.kernels.proximity import contacts, least_contacts
 from dt_viz.motion.stack import LIVE
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
-from dt_viz.robot.robot import load_jaco
+from dt_viz.robot.models import load_jaco
 
 TICK, LATE = 0.01, 0.5
 SETTINGS = ControllerSettings()

@@ -12,7 +12,7 @@ from dt_viz.control.settings import ControllerSettings
 from dt_viz.flows.diffeomorphisms import Identity
 from dt_viz.motion.stack import LIVE
 from dt_viz.obstacles.shapes import Sphere, as_point
-from dt_viz.robot.robot import load_jaco
+from dt_viz.robot.models import load_jaco
 
 TICK = 0.01
 MARGIN = 0.03

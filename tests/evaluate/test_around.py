@@ -12,7 +12,7 @@ from dt_viz.evaluate.around import TURN_ARC, Place, Rollout, _shares
 from dt_viz.metrics import distance_from_path, sharpest_turn
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.obstacles.union import Union
-from dt_viz.robot.robot import load_jaco
+from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.tasks import lasa_tasks
 from dt_viz.warning import ARM, Kind, MotionWarning
 

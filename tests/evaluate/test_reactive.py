@@ -9,7 +9,7 @@ import pytest
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.evaluate import reactive
 from dt_viz.obstacles.shapes import Sphere, as_point
-from dt_viz.robot.robot import load_jaco
+from dt_viz.robot.models import load_jaco
 
 
 def test_reactive_writes_what_its_figures_are_computed_from_and_repeats(measured, robot):

@@ -16,7 +16,7 @@ from dt_viz.evaluate.options import InputError
 from dt_viz.metrics import discrete_frechet, resample_by_arc_length
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.obstacles.union import Union
-from dt_viz.robot.robot import load_jaco
+from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import TASKS
 

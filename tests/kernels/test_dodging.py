@@ -8,7 +8,7 @@ from body_spheres import cover
 
 from dt_viz.kernels.dodging import ENOUGH, Forecast, LimitedArm, dodge
 from dt_viz.obstacles.shapes import Box, Sphere, as_point, records
-from dt_viz.robot.robot import load_jaco
+from dt_viz.robot.models import load_jaco
 
 ROBOT = load_jaco()
 LINKS = load_jaco().links

@@ -12,7 +12,7 @@ from dt_viz.flows.integrators import DORMAND_PRINCE, RK4, carried
 from dt_viz.kernels.proximity import COMPLEX_STEP
 from dt_viz.obstacles.shapes import as_point
 from dt_viz.obstacles.union import Union
-from dt_viz.robot.robot import load_jaco
+from dt_viz.robot.models import load_jaco
 
 ROBOT = load_jaco()
 ARM = WholeArm(ROBOT)

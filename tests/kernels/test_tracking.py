@@ -7,7 +7,7 @@ import pytest
 from dt_viz.kernels.blocks import LANES
 from dt_viz.kernels.tracking import Postures, settle, walk
 from dt_viz.robot.inverse_kinematics import soft_limits
-from dt_viz.robot.robot import load_jaco
+from dt_viz.robot.models import load_jaco
 
 ROBOT = load_jaco()
 ARM = ROBOT.tracking_arm

@@ -47,7 +47,7 @@ from dt_viz.obstacles.shapes import (
     as_point,
 )
 from dt_viz.obstacles.solids import Solid
-from dt_viz.robot.robot import HOME, load_jaco
+from dt_viz.robot.models import HOME, load_jaco
 from dt_viz.scenario.tasks import DRAWING_AXES
 
 Points = Callable[[int], np.ndarray]

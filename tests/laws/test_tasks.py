@@ -8,7 +8,7 @@ from dt_viz.avoidance.avoidance import SPACES
 from dt_viz.flows.diffeomorphisms import min_det_jacobian, round_trip_error
 from dt_viz.metrics import discrete_frechet, resample_by_arc_length
 from dt_viz.robot.inverse_kinematics import inverse_kinematics, track
-from dt_viz.robot.robot import load_jaco
+from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.frame import Stage

@@ -13,7 +13,7 @@ from dt_viz.motion.stack import FINE
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.robot.body_points import BodyPoints
 from dt_viz.robot.collision import Nearest
-from dt_viz.robot.robot import load_jaco
+from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.scenario import Layer, Scenario, View
 from dt_viz.scenario.stack import plane_of
 from dt_viz.scenario.tasks import TASKS

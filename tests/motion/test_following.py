@@ -19,7 +19,7 @@ from dt_viz.obstacles.shapes import Sphere
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.collision import SELF_MARGIN
 from dt_viz.robot.inverse_kinematics import UnreachableError
-from dt_viz.robot.robot import load_jaco
+from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.engine import Engine

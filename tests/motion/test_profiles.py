@@ -17,7 +17,7 @@ from dt_viz.metrics import (
 )
 from dt_viz.motion import profiles as profiles_module
 from dt_viz.motion.profiles import NUM_SAMPLES
-from dt_viz.robot.robot import load_jaco
+from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.scenario import View
 from dt_viz.session.frame import Stage
 from dt_viz.ui.tabs.plots import HealthPlots

@@ -14,9 +14,10 @@ from scipy.spatial import KDTree
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.robot.body_points import PROTRUSION, BodyPoints
 from dt_viz.robot.collision import SELF_REACH
+from dt_viz.robot.cover import bounding_sphere
 from dt_viz.robot.link_distances import SELF_TOLERANCE
 from dt_viz.robot.meshes import LinkMesh
-from dt_viz.robot.robot import load_jaco
+from dt_viz.robot.models import load_jaco
 from dt_viz.shipped import ASSETS
 
 SCRIPT = Path(__file__).parents[2] / "assets" / "make_body_points.py"
@@ -125,14 +126,14 @@ class TestCover:
             np.testing.assert_allclose(made["offset"], shipped["offset"], rtol=0, atol=2.1e-5)
             np.testing.assert_allclose(made["radius"], shipped["radius"], rtol=0, atol=2.1e-5)
 
-    def test_the_scripts_balls_around_others_are_hardly_larger_than_they_must_be(self):
+    def test_balls_around_others_are_hardly_larger_than_they_must_be(self):
         """Around spheres inside a ball, some of which touch it from within, it is that ball, or 2 % larger."""
         rng = np.random.default_rng(0)
         for num in (4, 20, 300):
             directions, radii = unit_sphere(num), rng.uniform(0.0, 0.02, num)
             directions[: num // 2] = -directions[num // 2 :]  # in opposite pairs: no smaller ball holds them
             spheres = np.column_stack([[0.3, -0.2, 0.1] + (0.05 - radii)[:, None] * directions, radii])
-            ball = script()._around(np.concatenate([spheres, [[0.31, -0.2, 0.1, 0.02]]]))
+            ball = bounding_sphere(np.concatenate([spheres, [[0.31, -0.2, 0.1, 0.02]]]))
             assert 0.05 - 1e-9 <= ball[3] < 0.051
             assert (np.linalg.norm(spheres[:, :3] - ball[:3], axis=1) + spheres[:, 3]).max() <= ball[3]
 

@@ -25,7 +25,7 @@ from dt_viz.robot.collision import (
 from dt_viz.robot.inverse_kinematics import inverse_kinematics, track
 from dt_viz.robot.link_distances import RESOLUTION, SELF_TOLERANCE, SHAPE_TOLERANCE, TOLERANCE
 from dt_viz.robot.meshes import LinkMesh
-from dt_viz.robot.robot import load_jaco
+from dt_viz.robot.models import load_jaco
 from dt_viz.warning import ARM, Kind, MotionWarning
 
 FOLDED = np.array([0.0, np.pi, 0.5, 0.0, 5.7, 0.0])  # the hand in the upper arm

@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
 
 from dt_viz.robot.inverse_kinematics import TrackedPath, UnreachableError, inverse_kinematics, track
-from dt_viz.robot.robot import Robot, load_jaco
+from dt_viz.robot.models import load_jaco
+from dt_viz.robot.robot import Robot
 
 BOX = np.array([[-0.4, -0.65, 0.05], [0.4, -0.3, 0.75]])  # where the tasks live, metres
 STEPS = 5 * load_jaco().tracking.step_tolerance  # rad, that a posture may be away from the best one

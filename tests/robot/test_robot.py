@@ -14,11 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from pinocchio_arm import pinocchio_configuration, pinocchio_model, placed_vertices, random_configurations
 
-from dt_viz.robot.robot import (
-    END_EFFECTOR_FRAME,
-    load_jaco,
-    urdf_path,
-)
+from dt_viz.robot.models import load_jaco, urdf_path
 
 
 class TestModel:
@@ -53,7 +49,7 @@ class TestModel:
         ],
     )
     def test_what_is_missing_is_named(self, monkeypatch, package, words):
-        monkeypatch.setattr("dt_viz.robot.robot.DISTRIBUTION", package)
+        monkeypatch.setattr("dt_viz.robot.models.DISTRIBUTION", package)
         with pytest.raises(FileNotFoundError, match=words):
             urdf_path()
 
@@ -62,7 +58,7 @@ class TestKinematics:
     @given(q=arrays(np.float64, (6,), elements=st.floats(-2 * np.pi, 2 * np.pi)))
     def test_places_and_their_derivatives_are_those_of_pinocchio(self, q):
         robot, (model, data, *_) = load_jaco(), pinocchio_model()
-        hand, turned = model.getFrameId(END_EFFECTOR_FRAME), pinocchio_configuration(q)
+        hand, turned = model.getFrameId("j2s6s200_end_effector"), pinocchio_configuration(q)
         expected = pin.computeFrameJacobian(model, data, turned, hand, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
         np.testing.assert_allclose(robot.jacobian(q), expected[:3], atol=1e-12)
         pin.framesForwardKinematics(model, data, turned)

@@ -6,7 +6,7 @@ from scipy.io import savemat
 
 from dt_viz.learning.demonstrations import DemonstrationError
 from dt_viz.robot.inverse_kinematics import inverse_kinematics
-from dt_viz.robot.robot import load_jaco
+from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.tasks import DRAWING_SIZE, POTS, TASKS, lasa_tasks
 
 

@@ -18,7 +18,7 @@ from dt_viz.evaluate.held_out import frechet
 from dt_viz.evaluate.table1 import drawn
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
-from dt_viz.robot.robot import load_jaco
+from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.paper_scenes import FIG_6_DIAMETER, FIG_6_PLACES
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.tasks import TASKS, TaskEntry, drawing_task

@@ -6,7 +6,7 @@ import pytest
 from dt_viz.motion.certificates import MAX_ROUND_TRIP
 from dt_viz.motion.diagnostics import MARGIN_TOLERANCE
 from dt_viz.motion.stack import FINE
-from dt_viz.robot.robot import load_jaco
+from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.frame import Stage
 from dt_viz.ui.visitor import initial_scenario

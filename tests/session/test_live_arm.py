@@ -10,7 +10,7 @@ from dt_viz.control.controller import Phase
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.metrics import distance_from_path
 from dt_viz.obstacles.shapes import Sphere, as_point
-from dt_viz.robot.robot import load_jaco
+from dt_viz.robot.models import load_jaco
 from dt_viz.session.frame import Stage
 from dt_viz.session.robot_loop import LiveArm, RoundSettings
 

@@ -23,7 +23,7 @@ from websockets.typing import Subprotocol
 
 from dt_viz.evaluate.protocol_client import OBSTACLE, LostError, ProtocolClient
 from dt_viz.obstacles.files import MAX_BYTES
-from dt_viz.robot.robot import load_jaco
+from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.progress import Pace
 from dt_viz.ui import gate

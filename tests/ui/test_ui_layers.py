@@ -12,7 +12,7 @@ from scenes import avoiding, changed, frame_at
 from viser import transforms  # noqa: TID251
 
 from dt_viz.obstacles.shapes import Sphere
-from dt_viz.robot.robot import load_jaco
+from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.panels import BASE_PANEL
 from dt_viz.scenario.scenario import View
 from dt_viz.scenario.tasks import TASKS

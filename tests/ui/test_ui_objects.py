@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dt_viz.robot.robot import load_jaco
+from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.tasks import POTS, TASKS
 from dt_viz.ui.scene.carried import INK_PERIOD, INK_STEP, Carried
 from dt_viz.ui.scene.palette import LIGHT

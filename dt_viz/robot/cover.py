@@ -1,0 +1,319 @@
+"""Covers of links with spheres that stick out of them by little, and the tree of these that body points are.
+
+A sphere around a place at the depth d in a link sticks out of it by no more than its radius less d. So many places in a
+link and on its surface are candidates, each with the sphere that sticks out by `CoverSettings.protrusion`, and the one
+that covers most of what is left of the surface is taken, again and again. Each then gets the radius that it needs.
+
+Bounding spheres of clusters make a tree of them: the outermost ones are the body points, found as in k-means, with a
+handicap for balls that were large; their number grows until none is larger than wanted. Below, clusters are halved.
+Lengths are metres, positions those of the joint's frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import chain, product
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy import ndimage
+from scipy.sparse import csr_array
+from scipy.spatial import KDTree
+
+from dt_viz.kernels.arm import BODY_POINT
+from dt_viz.obstacles.triangles import grid_nodes, inside_of_grid, surface_samples
+from dt_viz.robot.meshes import LinkMesh
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from dt_viz.flows.fields import Array, Indices, Mask
+
+Progress = Callable[[float], object]
+"""Is told the fraction that is done, in [0, 1]."""
+
+
+@dataclass(frozen=True)
+class CoverSettings:
+    """Settings of a cover. Those of the file that ships with the JACO are in ``assets/make_body_points.py``."""
+
+    protrusion: float = 5.5e-3
+    """Distance by which the smallest spheres stick out of a link, metres."""
+    spacing: float = 3e-3
+    """Spacing of the points on the surface that spheres are chosen for, metres."""
+    fine_spacing: float = 1.5e-3
+    """Spacing of the points on the surface that their radii hold, metres."""
+    inner_spacing: float = 4.5e-3
+    """Spacing of the candidates in a link, metres."""
+    outer_spacing: float = 3e-3
+    """Spacing of the candidates on the surface, metres."""
+    closing: float = 6e-3
+    """Radius of balls that do not enter a link's hollows, metres: these count as solid, as what is open to
+    one side alone. 0 leaves all hollows, and all candidates."""
+    rounding: float = 1.4
+    """Largest radius of a body point, in halves of its link's thickness."""
+    radii: tuple[float, float] = (0.03, 0.085)
+    """Least and largest value of that radius, in the arm's reach."""
+    num_starts: int = 1
+    """Number of beginnings of the clustering, the best of which is taken."""
+    rounds: int = 12
+    """Rounds of the clustering."""
+    evening: float = 0.5
+    """Part of a difference in radius by which a ball gives up spheres in the next round."""
+    num_leaves: int = 4
+    """Largest number of spheres that are not parted any more."""
+
+
+GROUP = 0.02
+"""Size of the cells in which points are compared with spheres, metres."""
+NEARLY = 0.9
+"""Part of the distance of two places by which one is deeper whose sphere holds most of the other's."""
+Spheres = np.ndarray
+"""(N, 4): centre and radius, metres."""
+
+
+def covering_tree(
+    meshes: Sequence[LinkMesh],
+    largest: Callable[[LinkMesh], float],
+    settings: CoverSettings = CoverSettings(),
+    progress: Progress = float,
+) -> NDArray[np.void]:
+    """Cover links with the spheres of `dt_viz.robot.body_points.BodyPoints`.
+
+    Args:
+        meshes: the links.
+        largest: the radius of a link's body points at most, metres.
+        settings: of the cover.
+        progress: is told how much is done.
+
+    Returns:
+        (N,) spheres of dtype `BODY_POINT`, by joint.
+    """
+    meshes = sorted(meshes, key=lambda mesh: mesh.joint)
+    work = np.cumsum([0.0, *(_area(mesh) for mesh in meshes)])
+    parts = []
+    for mesh, done in zip(meshes, work[1:] / work[-1], strict=True):
+        for cluster in _clusters(cover(mesh, settings), largest(mesh), settings):
+            nodes, sizes = _tree(cluster, settings.num_leaves)
+            part = np.zeros(len(nodes), BODY_POINT)
+            part["joint"], part["offset"] = mesh.joint, nodes[:, :3].round(5)
+            part["radius"] = np.ceil(1e5 * (nodes[:, 3] + 1e-5)) / 1e5  # what rounding the centres costs
+            part["end"] = sum(map(len, parts)) + np.arange(len(nodes)) + sizes
+            parts.append(part)
+        progress(float(done))
+    return np.concatenate(parts)
+
+
+def protrusion(tree: NDArray[np.void], meshes: Sequence[LinkMesh], spacing: float = 2e-3) -> tuple[float, float]:
+    """Measure how far the spheres that cover links stick out of them.
+
+    Args:
+        tree: as of `covering_tree`.
+        meshes: the links.
+        spacing: of points on the surfaces of spheres and links, metres.
+
+    Returns:
+        The mean over the outside of all spheres that move, and the largest such distance, metres.
+    """
+    found = [np.zeros(1)]
+    for joint in np.unique([mesh.joint for mesh in meshes if mesh.joint >= 0]):
+        spheres = tree[(tree["joint"] == joint) & (tree["end"] == np.arange(len(tree)) + 1)]
+        surface = KDTree(np.concatenate([_on_surface(mesh, spacing) for mesh in meshes if mesh.joint == joint]))
+        centres, radii = spheres["offset"], spheres["radius"]
+        around = KDTree(centres)
+        for centre, radius in zip(centres, radii, strict=True):
+            points = centre + radius * _evenly(int(4 * np.pi * (radius / (2 * spacing)) ** 2) + 8)
+            others = around.query_ball_point(centre, radius + radii.max())
+            inside = np.linalg.norm(points[:, None] - centres[others], axis=2) < radii[others] - 1e-9
+            found.append(surface.query(points[~inside.any(axis=1)])[0])
+    away = np.concatenate(found)
+    return float(away.mean()), float(away.max())
+
+
+def _evenly(num: int) -> Array:
+    """Spread unit vectors (num, 3) along a spiral from pole to pole."""
+    height, angle = (np.arange(num) + 0.5) / num * 2 - 1, np.pi * (1 + np.sqrt(5)) * np.arange(num)
+    ring = np.sqrt(1 - height**2)
+    return np.stack([ring * np.cos(angle), ring * np.sin(angle), height], axis=1)
+
+
+def thickness(mesh: LinkMesh) -> float:
+    """Compute the middle side, metres, of a box along the principal axes of a link: what is thick of it."""
+    points = mesh.vertices - mesh.vertices.mean(axis=0)
+    return float(np.sort(np.ptp(points @ np.linalg.svd(points, full_matrices=False)[2].T, axis=0))[-2])
+
+
+class _Solid(NamedTuple):
+    """What a link takes up, without hollows that no ball of the settings enters."""
+
+    inner: Array  # (N, 3) nodes of a grid in it, metres
+    outline: Array  # (M, 3) points on its outside
+
+
+def cover(mesh: LinkMesh, settings: CoverSettings) -> Spheres:
+    """Find spheres that cover a link."""
+    fine = _on_surface(mesh, settings.fine_spacing)
+    surface, spacing = fine, settings.fine_spacing
+    if settings.spacing > spacing:
+        surface, spacing = _thinned(fine, settings.spacing), settings.spacing
+    solid = _solid(mesh, fine, settings)
+    outer = surface[:: max(1, round((settings.outer_spacing / spacing) ** 2))]
+    centres = np.concatenate([solid.inner, outer])
+    radii = KDTree(solid.outline).query(centres)[0] + settings.protrusion - settings.fine_spacing / 4
+    # reduced so that what lies between points is covered, too
+    taken = _greedy(surface, centres, radii - settings.fine_spacing / 2)
+    return _fitted(centres[taken], radii[taken], fine, settings.fine_spacing / 2)
+
+
+def _greedy(points: Array, centres: Array, radii: Array) -> Indices:
+    """Choose spheres that hold all points (N, 3), always the one that holds most of what is left."""
+    found = KDTree(points).query_ball_point(centres, radii)
+    counts = np.fromiter(map(len, found), np.int64, len(found))
+    held = np.fromiter(chain.from_iterable(found), np.int32, counts.sum())
+    holds = csr_array((np.ones(len(held), np.int8), held, np.r_[0, np.cumsum(counts)]), (len(centres), len(points)))
+    holders = holds.tocsc()
+    left, gains, taken = np.ones(len(points), bool), counts.copy(), []
+    while left.any():
+        k = int(gains.argmax())
+        taken.append(k)
+        own = held[holds.indptr[k] : holds.indptr[k + 1]]
+        own = own[left[own]]
+        left[own] = False
+        losing = np.concatenate([holders.indices[holders.indptr[p] : holders.indptr[p + 1]] for p in own])
+        gains -= np.bincount(losing, minlength=len(gains))
+    return np.array(taken)
+
+
+def _fitted(centres: Array, radii: Array, points: Array, slack: float) -> Spheres:
+    """Give each sphere the radius for those of the points (N, 3) that are deepest in it, or nearest to it."""
+    needed = np.zeros(len(radii))
+    _, member = np.unique(np.floor(points / GROUP).astype(int), axis=0, return_inverse=True)
+    for some in np.split(points[np.argsort(member.ravel())], np.cumsum(np.bincount(member.ravel()))[:-1]):
+        middle = some.mean(axis=0)
+        about = np.linalg.norm(centres - middle, axis=1) - radii
+        near = np.flatnonzero(about <= about.min() + 2 * np.linalg.norm(some - middle, axis=1).max() + 1e-9)
+        away = np.linalg.norm(some[:, None] - centres[near], axis=2)
+        own = (away - radii[near]).argmin(axis=1)
+        np.maximum.at(needed, near[own], away[np.arange(len(some)), own])
+    kept = needed > 0
+    return np.column_stack([centres, needed + slack])[kept]
+
+
+def _on_surface(mesh: LinkMesh, spacing: float) -> Array:
+    """Spread points over a link's surface, its vertices included."""
+    return np.concatenate([mesh.vertices, surface_samples(mesh.vertices[mesh.faces], spacing)[0]])
+
+
+def _thinned(points: Array, cell: float) -> Array:
+    """Keep one point in each cell of a grid."""
+    return points[np.unique(np.floor(points / cell).astype(int), axis=0, return_index=True)[1]]
+
+
+def _area(mesh: LinkMesh) -> float:
+    a, b, c = mesh.vertices[mesh.faces].swapaxes(0, 1)
+    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+
+
+def _solid(mesh: LinkMesh, surface: Array, settings: CoverSettings) -> _Solid:
+    """Fill a link with nodes of a grid."""
+    cell, pad = settings.inner_spacing, int(np.ceil(2 * settings.closing / settings.inner_spacing))
+    lower, upper = surface.min(axis=0) - pad * cell, surface.max(axis=0) + pad * cell
+    shape = tuple(int(n) for n in np.ceil((upper - lower) / cell) + 1)
+    nodes, inside = grid_nodes(lower, cell, shape), inside_of_grid(mesh.vertices[mesh.faces], lower, cell, shape)
+    if not settings.closing:
+        return _Solid(nodes[inside.ravel()], surface)
+    at, shell = tuple(np.round((surface - lower) / cell).astype(int).T), np.zeros(shape, bool)
+    shell[at] = True
+    closed = _closed(inside | shell, settings.closing / cell)
+    depth = np.asarray(ndimage.distance_transform_edt(closed))
+    border = nodes[((depth > 0) & (depth < 1.5)).ravel()]
+    bridging = border[KDTree(surface).query(border)[0] > 1.5 * cell]
+    outline = np.concatenate([surface[depth[at] < 2.5], bridging])
+    solid = inside | (closed & ~shell)
+    return _Solid(nodes[(solid & _ridges(depth)).ravel()], outline)
+
+
+def _closed(inside: Mask, radius: float) -> Mask:
+    """Fill what no ball of a radius, in cells, reaches from outside, and what is open to one side at most."""
+    grown = np.asarray(ndimage.distance_transform_edt(~inside)) <= radius
+    closed = np.asarray(ndimage.distance_transform_edt(ndimage.binary_fill_holes(grown))) > radius
+    walls = sum(
+        np.flip(np.maximum.accumulate(np.flip(inside, axis), axis=axis), axis).astype(np.int8)
+        + np.maximum.accumulate(inside, axis=axis)
+        for axis in range(3)
+    )
+    return inside | closed | (walls >= 5)
+
+
+def _ridges(depth: Array) -> Mask:
+    """Find nodes that no neighbour is deeper than by nearly its distance: spheres of others are in that of one."""
+    padded, kept = np.pad(depth, 1), np.ones(depth.shape, bool)
+    n, m, k = depth.shape
+    for step in product(range(3), repeat=3):
+        x, y, z = step
+        away = np.linalg.norm(np.array(step) - 1)
+        if away:
+            kept &= padded[x : x + n, y : y + m, z : z + k] < depth + NEARLY * away
+    return kept
+
+
+# --- The tree ---
+
+
+def _clusters(spheres: Spheres, largest: float, settings: CoverSettings) -> list[Spheres]:
+    """Part spheres so that bounding spheres are not larger than wanted."""
+    rng = np.random.default_rng(0)
+    for k in range(1, len(spheres) + 1):
+        found = [
+            part
+            for _ in range(settings.num_starts)
+            for part in _clusterings(spheres, min(k, len(spheres)), rng, settings)
+        ]
+        radius, best = min(found, key=lambda found: found[0])
+        if radius <= largest:
+            return best
+    return list(spheres[:, None])
+
+
+def _clusterings(
+    spheres: Spheres, k: int, rng: np.random.Generator, settings: CoverSettings
+) -> Iterator[tuple[float, list[Spheres]]]:
+    """Part spheres into at most k clusters, round by round, each after its largest radius."""
+    centres, handicap = rng.choice(spheres[:, :3], k, replace=False), np.zeros(k)
+    for _ in range(settings.rounds):
+        away = np.linalg.norm(spheres[:, None, :3] - centres, axis=2) + spheres[:, 3:]
+        nearest = (away + handicap).argmin(axis=1)
+        kept = np.unique(nearest)
+        clusters = [spheres[nearest == cluster] for cluster in kept]
+        around = np.array([bounding_sphere(cluster) for cluster in clusters])
+        yield around[:, 3].max(), clusters
+        centres, handicap = around[:, :3], handicap[kept] + settings.evening * (around[:, 3] - around[:, 3].mean())
+
+
+def bounding_sphere(spheres: Spheres) -> Array:
+    """Find the smallest sphere (4,) around others, about: its centre steps to the farthest (Bădoiu and Clarkson)."""
+    centres, radii = np.array(spheres[:, :3]), spheres[:, 3]
+    centre = spheres[:, :3].mean(axis=0)
+    for step in range(2, 100):
+        away = centres - centre
+        farthest = (np.sqrt(np.add.reduce(away * away, axis=1)) + radii).argmax()
+        length = np.linalg.norm(away[farthest])
+        if length:
+            centre = centre + away[farthest] * (1 + radii[farthest] / length) / step
+    return np.append(centre, (np.linalg.norm(centres - centre, axis=1) + radii).max())
+
+
+def _tree(spheres: Spheres, num_leaves: int) -> tuple[Spheres, Indices]:
+    """Return the spheres and those around halves of them, depth first, and the number (M,) in each with itself."""
+    if len(spheres) == 1:
+        return spheres, np.ones(1, dtype=int)
+    if len(spheres) <= num_leaves:
+        parts = list(spheres[:, None])
+    else:
+        along = np.ptp(spheres[:, :3], axis=0).argmax()
+        order = spheres[:, along].argsort()
+        parts = [spheres[half] for half in np.array_split(order, 2)]
+    trees = [_tree(part, num_leaves) for part in parts]
+    nodes = np.concatenate([bounding_sphere(spheres)[None], *(nodes for nodes, _ in trees)])
+    return nodes, np.concatenate([[len(nodes)], *(sizes for _, sizes in trees)])

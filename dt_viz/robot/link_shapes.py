@@ -1,0 +1,259 @@
+"""Shapes of an arm's links, read from a URDF: solids for collisions, and coloured meshes that are drawn.
+
+Pinocchio reads a URDF that is reduced to what is needed: joints that are no part of the chain (grippers, other
+branches) are fixed, and addresses of meshes are paths. Links without collision shapes have those that are drawn.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (pinocchio has no stubs)
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+from xml.etree import ElementTree
+
+import numpy as np
+import pinocchio as pin
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from dt_viz.errors import FormatError
+from dt_viz.robot.kinematics import Kinematics
+from dt_viz.robot.meshes import LinkMesh, VisualMesh
+from dt_viz.robot.tool_chain import ArmChain
+from dt_viz.robot.urdf import Description
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from dt_viz.flows.fields import Array, Indices
+
+SHAPES = ("box", "cylinder", "sphere", "mesh")
+COLOURED = (".dae", ".obj", ".glb", ".gltf", ".ply")
+"""Suffixes of files of meshes that have colours of their own."""
+SHORTEST_HAND = 0.03
+"""Least distance of the tool from the last joint for that to be the hand's direction, metres; else that is its z."""
+
+
+class Reduced(NamedTuple):
+    """A URDF of a chain alone."""
+
+    text: str
+    files: tuple[Path, ...]
+    """Meshes that it needs."""
+
+
+def reduced(description: Description, chain: ArmChain, package_dirs: Sequence[Path]) -> Reduced:
+    """Reduce a URDF to a chain: its links with all that is fixed to them.
+
+    Args:
+        description: of the robot.
+        chain: the joints that move.
+        package_dirs: folders in which `package://` addresses resolve.
+
+    Raises:
+        FormatError: A mesh is missing, or a shape is of another kind.
+    """
+    root, files = ElementTree.Element("robot", name=description.name), []
+    for name, element in description.links.items():
+        link = ElementTree.SubElement(root, "link", name=name)
+        shapes = {tag: copy.deepcopy(element.findall(tag)) for tag in ("collision", "visual")}
+        if not shapes["collision"]:
+            shapes["collision"] = copy.deepcopy(shapes["visual"])
+        for tag, found in shapes.items():
+            for shape in found:
+                kind = shape.find("geometry/*")
+                if kind is None or kind.tag not in SHAPES:
+                    raise FormatError(f"link {name}: {tag}", "nothing" if kind is None else kind.tag, ", ".join(SHAPES))
+                if kind.tag == "mesh":
+                    file = _mesh_file(kind.get("filename", ""), description.path, package_dirs, f"link {name}: {tag}")
+                    kind.set("filename", str(file))
+                    files.append(file)
+                shape.tag = tag
+                link.append(shape)
+    moving = {joint.name for joint in chain.joints}
+    for name, joint in description.joints.items():
+        kept = ElementTree.SubElement(root, "joint", name=name, type=joint.kind if name in moving else "fixed")
+        kept.extend(joint.element.iterfind("parent"))
+        kept.extend(joint.element.iterfind("child"))
+        if name in moving:
+            kept.extend(part for tag in ("origin", "axis") for part in joint.element.iterfind(tag))
+            lower, upper, velocity = np.nan_to_num(joint.limits, posinf=0.0, neginf=0.0).tolist()
+            ElementTree.SubElement(
+                kept, "limit", lower=f"{lower!r}", upper=f"{upper!r}", velocity=f"{velocity!r}", effort="0"
+            )
+        elif chain.locked.get(name):
+            turn, place = joint.moved(chain.locked[name])
+            rpy = Rotation.from_matrix(turn).as_euler("xyz")
+            ElementTree.SubElement(
+                kept, "origin", xyz=" ".join(map(repr, place.tolist())), rpy=" ".join(map(repr, rpy.tolist()))
+            )
+        else:
+            kept.extend(joint.element.iterfind("origin"))
+    root.extend(description.materials)
+    return Reduced(ElementTree.tostring(root, encoding="unicode"), tuple(dict.fromkeys(files)))
+
+
+def _mesh_file(address: str, urdf: Path, package_dirs: Sequence[Path], field: str) -> Path:
+    """Find the file of a mesh."""
+    scheme, _, rest = address.rpartition("://")
+    if scheme in ("package", "model"):
+        inside = Path(*Path(rest).parts[1:])  # of the package, whose folder may have another name
+        candidates = [folder / rest for folder in (*package_dirs, *urdf.parents)]
+        candidates += [folder / inside for folder in package_dirs]
+    else:
+        candidates = [urdf.parent / rest]
+    for path in candidates:
+        if path.is_file():
+            return path.resolve()
+    looked = f"a file; looked in {candidates[0]}" + (
+        " and others; name its package_dirs=" if len(candidates) > 1 else ""
+    )
+    raise FormatError(field, f"no mesh {address!r}", looked)
+
+
+class Shapes(NamedTuple):
+    """What moves with the joints of a chain, in the URDF's base frame and with joints about z."""
+
+    kinematics: Kinematics
+    meshes: tuple[LinkMesh, ...]
+    """Collision shapes, one for each link, by joint."""
+    visuals: tuple[VisualMesh, ...]
+
+
+def read_shapes(text: str, chain: ArmChain) -> Shapes:
+    """Read kinematics and shapes of a reduced URDF.
+
+    With A_i e_z the axis of joint i in its own frame in the URDF, R_i' = A_{i-1}ᵀ R_i A_i, t_i' = A_{i-1}ᵀ t_i, and
+    what moves with the joint is turned by A_iᵀ.
+
+    Raises:
+        FormatError: A mesh cannot be read, or no link has a shape.
+    """
+    model = pin.buildModelFromXML(text)
+    turns = [_to_axis(joint.axis) for joint in chain.joints]
+    before = [np.eye(3), *turns]
+    places = model.jointPlacements[1:]
+    hand = model.frames[model.getFrameId(chain.tool, pin.FrameType.BODY)].placement
+    offset = _turned(hand.translation + hand.rotation @ chain.offset, turns[-1])
+    far = float(np.linalg.norm(offset)) > SHORTEST_HAND
+    kinematics = Kinematics(
+        constant(
+            [
+                _turned(_turned(place.rotation.T, first).T, turn)
+                for place, first, turn in zip(places, before, turns, strict=False)
+            ]
+        ),
+        constant([_turned(place.translation, first) for place, first in zip(places, before, strict=False)]),
+        constant(offset),
+        constant(offset if far else _turned(hand.rotation[:, 2], turns[-1])),
+    )
+    solids: dict[str, LinkMesh] = {}
+    for name, shape in _geometry(model, text, pin.GeometryType.COLLISION):
+        mesh = LinkMesh(name, shape.parentJoint - 1, *_placed(*_triangles(shape.geometry), shape, before))
+        solids[name] = _joined(solids[name], mesh) if name in solids else mesh
+    if not solids:
+        raise FormatError("links", "neither collision shapes nor visuals", f"links with shapes: {', '.join(SHAPES)}")
+    visuals = []
+    for _, shape in _geometry(model, text, pin.GeometryType.VISUAL):
+        for name, vertices, faces, colour in _coloured(shape):
+            visuals.append(VisualMesh(name, shape.parentJoint - 1, *_placed(vertices, faces, shape, before), colour))
+    by_joint = sorted(solids.values(), key=lambda mesh: mesh.joint)
+    return Shapes(kinematics, tuple(by_joint), tuple(visuals))
+
+
+def _geometry(model: Any, text: str, kind: Any) -> Iterator[tuple[str, Any]]:  # noqa: ANN401 - no stubs
+    """Yield shapes with the names of their links."""
+    try:
+        found = pin.buildGeomFromUrdfString(model, text, kind, package_dirs=[]).geometryObjects
+    except (ValueError, RuntimeError) as error:
+        raise FormatError("mesh", " ".join(str(error).split())[:200], "STL, OBJ, DAE with triangles") from error
+    for shape in found:
+        yield model.frames[shape.parentFrame].name, shape
+
+
+def _to_axis(axis: Array) -> Array:
+    """Return a rotation (3, 3) of e_z to an axis (3,): of the coordinates where it is along one."""
+    k = int(np.abs(axis).argmax())
+    if np.abs(axis)[k] == 1.0 and axis[k] > 0:
+        return np.roll(np.eye(3), k - 2, axis=1).T.copy()
+    return Rotation.align_vectors(axis[None], [[0.0, 0.0, 1.0]])[0].as_matrix()
+
+
+def _turned(vectors: Array, turn: Array) -> Array:
+    """Express vectors (*B, 3) in a turned frame; where it is not turned they stay what they are, to the last bit."""
+    return np.asarray(vectors) if np.array_equal(turn, np.eye(3)) else vectors @ turn
+
+
+def _placed(vertices: Array, faces: Indices, shape: Any, turns: Sequence[Array]) -> tuple[Array, Indices]:  # noqa: ANN401
+    """Place a shape in the frame of its joint."""
+    placed = vertices @ shape.placement.rotation.T + shape.placement.translation
+    faces = np.array(faces, dtype=np.intp)
+    faces.flags.writeable = False
+    return constant(_turned(placed, turns[shape.parentJoint])), faces
+
+
+def _joined(mesh: LinkMesh, other: LinkMesh) -> LinkMesh:
+    """Join two shapes of a link."""
+    faces = np.concatenate([mesh.faces, other.faces + len(mesh.vertices)])
+    faces.flags.writeable = False
+    return LinkMesh(mesh.name, mesh.joint, constant(np.concatenate([mesh.vertices, other.vertices])), faces)
+
+
+def _triangles(shape: Any) -> tuple[Array, Indices]:  # noqa: ANN401 - no stubs
+    """Return vertices (V, 3), metres, and faces (F, 3) of a shape."""
+    kind = type(shape).__name__
+    if hasattr(shape, "num_tris"):
+        triangles = (shape.tri_indices(i) for i in range(shape.num_tris))
+        return shape.vertices(), np.array([[triangle[k] for k in range(3)] for triangle in triangles])
+    made: dict[str, Callable[[], trimesh.Trimesh]] = {
+        "Box": lambda: trimesh.creation.box(2 * shape.halfSide),
+        "Sphere": lambda: trimesh.creation.icosphere(3, shape.radius),
+        "Cylinder": lambda: trimesh.creation.cylinder(shape.radius, 2 * shape.halfLength, sections=48),
+    }
+    solid = made[kind]()
+    return np.array(solid.vertices), np.array(solid.faces)
+
+
+def _coloured(shape: Any) -> Iterator[tuple[str, Array, Indices, tuple[int, int, int]]]:  # noqa: ANN401 - no stubs
+    """Yield the parts of a drawn shape, each with a name and a colour: that of the file, or of the URDF."""
+    path = Path(shape.meshPath)
+    if path.suffix.lower() in COLOURED and hasattr(shape.geometry, "num_tris"):
+        parts = _coloured_parts(path, np.asarray(shape.meshScale))
+        extents = [
+            (all_of.min(axis=0), all_of.max(axis=0))
+            for all_of in (shape.geometry.vertices(), np.concatenate([np.empty((0, 3)), *(part[1] for part in parts)]))
+            if len(all_of)
+        ]
+        if len(extents) == 2 and np.allclose(*extents, atol=1e-3):  # other readers scale and turn some files otherwise
+            yield from parts
+            return
+    red, green, blue = (round(255 * float(value)) for value in shape.meshColor[:3])
+    yield path.name, *_triangles(shape.geometry), (red, green, blue)
+
+
+def _coloured_parts(path: Path, scale: Array) -> list[tuple[str, Array, Indices, tuple[int, int, int]]]:
+    """Read the parts of a file of meshes with their colours; none where that is not possible."""
+    try:
+        scene = trimesh.load_scene(path)
+        found = scene.dump()
+    except Exception:  # of whatever reader the file needs: its triangles are there without colours, too
+        return []
+    parts = []
+    for mesh in found:
+        if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
+            colour = getattr(getattr(mesh.visual, "material", None), "main_color", None)
+            colour = (230, 230, 230) if colour is None else colour
+            red, green, blue = (int(value) for value in colour[:3])
+            parts.append((path.name, np.array(mesh.vertices) * scale, np.array(mesh.faces), (red, green, blue)))
+    return parts
+
+
+def constant(values: ArrayLike) -> Array:
+    """Return a read-only copy."""
+    array = np.array(values, dtype=float)
+    array.flags.writeable = False
+    return array

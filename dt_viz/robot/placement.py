@@ -1,0 +1,117 @@
+"""Placement of a task in an arm's reach: moved and scaled so that the arm follows it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dt_viz.robot.inverse_kinematics import UnreachableError, inverse_kinematics, track
+
+if TYPE_CHECKING:
+    from dt_viz.flows.fields import Array
+    from dt_viz.robot.robot import Robot
+
+REFERENCE_SHOULDER = (0.0, 0.0, 0.28)
+"""Place of the JACO's shoulder, metres, which tasks were made for."""
+
+
+@dataclass(frozen=True)
+class PlacementSettings:
+    """Settings of where a task is placed; lengths are parts of the arm's reach."""
+
+    scales: tuple[float, ...] = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2)
+    """Scales that are tried, in the first one."""
+    ahead: tuple[float, ...] = (0.0, -0.1, 0.1, -0.2)
+    """Moves ahead that are tried."""
+    up: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3)
+    """Moves upwards that are tried."""
+    num_samples: int = 40
+    """Number of samples of each path that are followed."""
+    error: float = 1e-3
+    """Distance of the hand from a path up to which it is followed, metres."""
+    room: float = 0.01
+    """Distance of links from each other that is kept, metres."""
+
+
+@dataclass(frozen=True)
+class Placement:
+    """A map of space that scales and moves: x ↦ scale·x + shift."""
+
+    scale: float
+    shift: tuple[float, float, float]
+    """Metres."""
+
+    def __call__(self, points: Array) -> Array:
+        """Map points (*B, 3), metres."""
+        return self.scale * np.asarray(points) + np.array(self.shift)
+
+
+def place(
+    robot: Robot,
+    paths: Sequence[Array],
+    scale: float | None = None,
+    settings: PlacementSettings = PlacementSettings(),
+) -> Placement:
+    """Find where an arm follows the paths of a task that was made for the JACO, or for an arm of its size.
+
+    They are scaled about the shoulder, by the arm's reach first, and moved a little where that is not enough; inverse
+    kinematics decides, within the limits, away from singularities, above the table and clear of the arm itself.
+
+    Args:
+        robot: the arm.
+        paths: (T, 3) positions of the hand on each, metres, with the arm's front at −y.
+        scale: the scale that is wanted; None takes the largest that fits, up to that of the arm's reach.
+        settings: what is tried.
+
+    Raises:
+        UnreachableError: No place fits, at the scale that is wanted; it says which one would.
+    """
+    sampled = np.array([_resampled(path, settings.num_samples) for path in paths])
+    first = robot.size if scale is None else scale
+    for part in settings.scales:
+        for placement in _candidates(robot, sampled, part * first, settings):
+            if follows(robot, placement(sampled), settings):
+                if scale is not None and part < 1:
+                    way_out = f"the largest scale that fits is about {placement.scale:.2g}"
+                    raise UnreachableError(f"{robot.title} cannot follow the task at the scale {scale:.3g}: {way_out}")
+                return placement
+    least = settings.scales[-1] * first
+    raise UnreachableError(f"{robot.title} cannot follow the task anywhere ahead of it, even at the scale {least:.2g}")
+
+
+def follows(robot: Robot, paths: Array, settings: PlacementSettings = PlacementSettings()) -> bool:
+    """Return whether an arm follows paths (R, T, 3), metres, from their starts."""
+    if paths[..., 2].min() < 0:
+        return False
+    try:
+        reference = inverse_kinematics(robot, paths[0, -1])
+        starts = np.array([inverse_kinematics(robot, path[0], seed=reference) for path in paths])
+    except UnreachableError:
+        return False
+    tracked = track(robot, paths, starts, reference=reference)
+    if tracked.error.max() > settings.error or tracked.limits_hit.any() or tracked.damped.any():
+        return False
+    for q in tracked.q[:, ::4]:
+        near = robot.collision.nearest_to_itself(q)
+        if (near is not None and near.distance < settings.room) or robot.collision.nearest_to_table(q).distance < 0:
+            return False
+    return True
+
+
+def _candidates(robot: Robot, paths: Array, scale: float, settings: PlacementSettings) -> Iterator[Placement]:
+    """Yield placements at a scale, the least moved first: about the shoulder, but no lower above the table."""
+    about = robot.shoulder - scale * np.array(REFERENCE_SHOULDER)
+    about[2] = max(about[2], min(1.0 - scale, 0.0) * paths[..., 2].min())
+    moves = sorted(product(settings.ahead, settings.up), key=lambda move: abs(move[0]) + abs(move[1]))
+    for ahead, up in moves:
+        x, y, z = about + robot.reach * np.array([0.0, -ahead, up])
+        yield Placement(scale, (float(x), float(y), float(z)))
+
+
+def _resampled(path: Array, num: int) -> Array:
+    """Take samples (num, 3) of a path (T, 3)."""
+    return np.asarray(path, dtype=float)[np.linspace(0, len(path) - 1, num).round().astype(int)]

@@ -1,0 +1,307 @@
+"""Arms by name and from files: what is found of them holds, is kept, and two are there at once."""
+
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import coal  # noqa: TID251, here it is the oracle
+import numpy as np
+import pytest
+import trimesh
+from arm_files import link, random_postures, urdf, write
+from scipy.spatial import KDTree
+
+from dt_viz.folders import default_cache_folder
+from dt_viz.robot import models
+from dt_viz.robot.arm_cache import from_arrays, to_arrays
+from dt_viz.robot.choices import semantic_homes
+from dt_viz.robot.cover import CoverSettings, cover, protrusion
+from dt_viz.robot.inverse_kinematics import UnreachableError
+from dt_viz.robot.meshes import LinkMesh
+from dt_viz.robot.models import ARMS, load_arm, load_jaco, robot_from_urdf, urdf_path
+from dt_viz.robot.placement import PlacementSettings, follows, place
+from dt_viz.robot.robot import Robot
+from dt_viz.robot.urdf import ArmError, read_semantic
+from dt_viz.scenario.tasks import TASKS
+
+QUICK = ("so100", "xarm7")
+each_arm = pytest.mark.parametrize(
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in ARMS if name != "jaco"]
+)
+
+
+def on_surface(mesh, num=20_000):
+    """All vertices, and points spread evenly over the triangles."""
+    rng, corners = np.random.default_rng(0), mesh.vertices[mesh.faces]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    chosen = corners[rng.choice(len(areas), num, p=areas / areas.sum())]
+    return np.concatenate([mesh.vertices, np.einsum("nk,nkd->nd", rng.dirichlet(np.ones(3), num), chosen)])
+
+
+def beyond(robot: Robot, mesh) -> float:
+    """How far the surface of a link is outside the smallest spheres of its joint at most, metres."""
+    spheres = robot.body.spheres
+    own = spheres[(spheres["joint"] == mesh.joint) & (spheres["end"] == np.arange(len(spheres)) + 1)]
+    points = on_surface(mesh)
+    for num in (20, len(own)):  # most points are in one of the nearest
+        _, near = KDTree(own["offset"]).query(points, min(num, len(own)))
+        away = np.linalg.norm(points[:, None] - own["offset"][near], axis=2) - own["radius"][near]
+        points = points[away.min(axis=1) > 0]
+        if not len(points):
+            return 0.0
+    return float(away.min(axis=1).max())
+
+
+@each_arm
+def test_spheres_hold_the_links_and_stick_out_by_little(name):
+    robot = load_arm(name)
+    assert max(beyond(robot, mesh) for mesh in robot.meshes) <= 1e-6
+    mean, most = protrusion(robot.body.spheres, robot.meshes)
+    assert mean < 5e-3 and most < 0.03
+    assert f"{1e3 * mean:.1f} mm in the mean" in robot.report()
+    wide = robot.body.spheres.copy()
+    wide["radius"] += 3e-3
+    assert protrusion(wide, robot.meshes)[0] > mean + 2e-3
+    ends = robot.body.spheres["end"]
+    assert (ends > np.arange(len(ends))).all() and (np.diff(robot.body.spheres["joint"]) >= 0).all()
+    for k in np.flatnonzero(ends > np.arange(len(ends)) + 1):
+        held = robot.body.spheres[k : ends[k]]
+        away = np.linalg.norm(held["offset"] - held["offset"][0], axis=1) + held["radius"]
+        assert away.max() <= held["radius"][0] + 3e-5
+
+
+@each_arm
+def test_home_is_within_the_limits_ahead_and_free_of_the_arm_itself_on_the_true_shapes(name):
+    robot = load_arm(name)
+    assert ((robot.home > robot.lower) & (robot.home < robot.upper)).all()
+    x, y, z = robot.end_effector(robot.home)
+    assert -y > 0.25 * robot.reach and abs(x) < 0.3 * robot.reach and z > 0
+    assert float(robot.chain(robot.home[:, None]).manipulability()[0]) > 0.05 * robot.reach**3
+    rotations, origins = robot.forward_kinematics(robot.home)
+    shapes = []
+    for mesh in robot.meshes:  # triangles anew for coal: nothing of ours but the vertices
+        solid = coal.BVHModelOBBRSS()
+        solid.beginModel(len(mesh.faces), len(mesh.vertices))
+        solid.addVertices(mesh.vertices)
+        solid.addTriangles(mesh.faces)
+        solid.endModel()
+        turn, origin = (np.eye(3), np.zeros(3)) if mesh.joint < 0 else (rotations[mesh.joint], origins[mesh.joint])
+        shapes.append((mesh, solid, coal.Transform3s(turn, origin)))
+    compared = 0
+    for k, (mesh, solid, at) in enumerate(shapes):
+        for other, other_solid, other_at in shapes[:k]:
+            if abs(mesh.joint - other.joint) > 1 and frozenset((mesh.name, other.name)) not in robot.touching:
+                compared += 1
+                assert not coal.collide(
+                    solid, at, other_solid, other_at, coal.CollisionRequest(), coal.CollisionResult()
+                )
+    assert compared > 5
+
+
+@each_arm
+def test_levers_are_those_of_the_hand_near_home(name):
+    robot = load_arm(name)
+    assert (robot.levers >= 0.04 * robot.reach - 1e-12).all() and (robot.levers < robot.reach + 0.3).all()
+    near = robot.clip(robot.home + 0.35 * np.random.default_rng(5).normal(size=(2000, robot.num_joints)))
+    moved = np.sqrt((np.linalg.norm(robot.jacobian(near), axis=1) ** 2).mean(axis=0))
+    np.testing.assert_allclose(robot.levers, np.maximum(moved, 0.04 * robot.reach), rtol=0.1)
+
+
+@each_arm
+def test_links_that_may_touch_are_few_and_the_others_are_apart_in_some_postures(name):
+    robot = load_arm(name)
+    names = {mesh.name for mesh in robot.meshes}
+    assert all(pair <= names and len(pair) == 2 for pair in robot.touching) and len(robot.touching) < 8
+    apart = [robot.collision.nearest_to_itself(q[None]) for q in random_postures(robot, 60)]
+    assert sum(near is None or near.distance > 0.01 for near in apart) > 10
+
+
+@each_arm
+def test_the_front_is_ahead_and_the_frame_is_the_urdfs_turned_about_the_vertical(name):
+    robot = load_arm(name)
+    np.testing.assert_allclose(robot.base @ robot.base.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(robot.base[2], [0, 0, 1], atol=0)
+    np.testing.assert_allclose(np.linalg.det(robot.base), 1, atol=1e-12)
+    assert not robot.lower.flags.writeable and not robot.meshes[0].vertices.flags.writeable
+
+
+@pytest.mark.parametrize("task", ["push_box", "lift_box", "draw_s"])
+@pytest.mark.parametrize("name", QUICK)
+def test_tasks_are_placed_where_the_arm_follows_them(name, task):
+    robot, paths = load_arm(name), TASKS[task]().paths
+    placement = place(robot, paths)
+    assert 0.4 * robot.size < placement.scale <= robot.size + 1e-12
+    moved = placement(np.array([path[np.linspace(0, len(path) - 1, 60).astype(int)] for path in paths]))
+    assert follows(robot, moved, PlacementSettings(error=1e-3))
+    with pytest.raises(UnreachableError, match=r"the largest scale that fits is about"):
+        place(robot, paths, scale=2.5 * robot.size)
+
+
+def test_the_jaco_has_its_tasks_where_they_are():
+    for task in ("push_box", "draw_w"):
+        placement = place(load_jaco(), TASKS[task]().paths)
+        assert (placement.scale, placement.shift) == (1.0, (0.0, 0.0, 0.0))
+
+
+def same(robot: Robot, other: Robot) -> None:
+    a, b = to_arrays(robot), to_arrays(other)
+    assert set(a) == set(b)
+    for name in a:
+        np.testing.assert_array_equal(a[name], b[name])
+
+
+def forget(monkeypatch, folder: Path) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(folder))
+
+
+def test_an_arm_is_kept_and_found_again_and_made_anew_if_its_file_is_damaged(tmp_path, monkeypatch, caplog):
+    forget(monkeypatch, tmp_path)
+    path, made = write(tmp_path, urdf(4)), []
+    real = models.covering_tree
+    monkeypatch.setattr(models, "covering_tree", lambda *given: made.append(1) or real(*given))
+    told: list[tuple[float, str]] = []
+    robot = robot_from_urdf(path, progress=lambda fraction, message: told.append((fraction, message)))
+    fractions = [fraction for fraction, _ in told]
+    assert fractions == sorted(fractions) and fractions[0] == 0 and fractions[-1] == 1 and len(told) > 8
+    assert any("covering" in message for _, message in told)
+    (file,) = (default_cache_folder() / "arms").glob("*.npz")
+    same(robot, robot_from_urdf(path))
+    assert len(made) == 1
+    content = file.read_bytes()
+    for damaged in (content[: len(content) // 2], b"", content[:1000] + bytes(200) + content[1200:]):
+        file.write_bytes(damaged)
+        same(robot, robot_from_urdf(path))
+        assert file.read_bytes() == content and "damaged" in caplog.text
+    assert len(made) == 4
+    write(tmp_path, urdf(4, link("aside").replace("aside", "l9") + BRANCH))  # another file: another arm
+    assert len(robot_from_urdf(path).meshes) == 6 and len(made) == 5
+    robot_from_urdf(path, home=(0.1, 0.5, 0.5, 0.1))
+    assert len(made) == 6
+
+
+BRANCH = '<joint name="on" type="fixed"><parent link="l0"/><child link="l9"/></joint>'
+
+
+def test_arrays_of_an_arm_that_do_not_fit_are_refused():
+    robot = load_arm("so100")
+    given = {"name": robot.name, "title": robot.title, "urdf": robot.urdf, "package_dirs": robot.package_dirs}
+    arrays = to_arrays(robot)
+    same(robot, from_arrays(arrays, given))
+    for broken in ({"home": np.zeros(3)}, {"mesh_joints": np.zeros(2, int)}, {"touching": np.zeros(3)}):
+        with pytest.raises((ValueError, KeyError, TypeError)):
+            from_arrays(arrays | broken, given)
+
+
+def test_two_arms_are_there_at_once_and_each_is_loaded_once():
+    five, seven, jaco = load_arm("so100"), load_arm("xarm7"), load_jaco()
+    assert (five.num_joints, seven.num_joints, jaco.num_joints) == (5, 7, 6)
+    assert load_arm("so100") is five and load_arm() is jaco
+    q = [robot.home + 0.1 for robot in (five, seven, jaco)]
+    before = [robot.end_effector(one) for robot, one in zip((five, seven, jaco), q, strict=True)]
+    after = [robot.end_effector(one) for robot, one in zip((jaco, seven, five), reversed(q), strict=True)]
+    np.testing.assert_array_equal(before, after[::-1])
+    assert {robot.links.spheres["joint"].max() for robot in (five, seven, jaco)} == {4, 6, 5}
+
+
+def test_what_was_chosen_is_said_with_reasons():
+    words = ["xArm7: 7 joints, reach 0.82 m", "joint1, joint2", "limits of the URDF", "link_eef: its name"]
+    words += [
+        "by convention",
+        "searched for; not 'home' of the SRDF: it is nearly singular",
+        "in the mean",
+        "may touch",
+    ]
+    assert [word for word in words if word not in load_arm("xarm7").report()] == []
+    assert "29 points of 2572 spheres: as shipped" in load_jaco().report()
+
+
+def test_states_of_an_srdf_are_homes_where_they_name_all_joints(tmp_path):
+    panda = read_semantic(urdf_path("panda", ARMS["panda"].srdf))
+    (name, posture), *others = semantic_homes(panda, [f"panda_joint{k}" for k in range(1, 8)])
+    assert name == "default" and not others
+    np.testing.assert_allclose(posture, [0, -0.785398, 0, -2.35619, 0, 1.5707, 0.785398])
+    assert semantic_homes(panda, ["panda_joint1", "another"]) == []
+
+
+def test_a_given_front_and_home_are_taken(tmp_path, monkeypatch):
+    forget(monkeypatch, tmp_path)
+    path, home = write(tmp_path, urdf(4)), (0.2, 0.6, -0.4, 0.3)
+    robot = robot_from_urdf(path, home=home, front="y", name="mine")
+    np.testing.assert_array_equal(robot.home, home)
+    np.testing.assert_allclose(robot.base @ [0, 1, 0], [0, -1, 0], atol=1e-15)
+    assert robot.name == robot.title == "mine" and "front" in robot.report()
+    plain = robot_from_urdf(path, home=home, front="-y")
+    np.testing.assert_allclose(robot.end_effector(home), robot.base @ plain.end_effector(home), atol=1e-12)
+    assert robot_from_urdf(write(tmp_path, urdf(4, name=""), "anonymous.urdf"), home=home).name == "anonymous"
+
+
+def test_names_that_nobody_knows_are_told(monkeypatch):
+    monkeypatch.setitem(sys.modules, "robot_descriptions", None)
+    with pytest.raises(ArmError, match=r"found 'nobody'; accepted: jaco, panda, .*pip install robot_descriptions"):
+        load_arm("nobody")
+
+
+REPOSITORIES = """
+class Repository:
+    def __init__(self, path): self.cache_path = path
+REPOSITORIES = {name: Repository(name) for name in ("small", "away")}
+"""
+CACHE = """
+import os
+def clone_to_cache(name, commit=None): raise AssertionError("downloaded")
+"""
+DESCRIPTION = """
+from ._cache import clone_to_cache as _clone_to_cache
+REPOSITORY_PATH = _clone_to_cache("NAME", commit=None)
+URDF_PATH = REPOSITORY_PATH + "/arm.urdf"
+"""
+
+
+@pytest.fixture
+def descriptions(tmp_path, monkeypatch):
+    """A package robot_descriptions whose files are not all there, and that would download them."""
+    folder, package = tmp_path / "robot_descriptions", ModuleType("robot_descriptions")
+    package.__path__ = [str(folder)]
+    files = {"_repositories.py": REPOSITORIES, "_cache.py": CACHE, "macro_description.py": "XACRO_PATH = 'x'"}
+    files |= {f"{name}_description.py": DESCRIPTION.replace("NAME", name) for name in ("small", "away")}
+    folder.mkdir()
+    for name, text in files.items():
+        write(folder, text, name)
+    (tmp_path / "files" / "small").mkdir(parents=True)
+    write(tmp_path / "files" / "small", urdf(4))
+    monkeypatch.setenv("ROBOT_DESCRIPTIONS_CACHE", str(tmp_path / "files"))
+    monkeypatch.setitem(sys.modules, "robot_descriptions", package)
+    yield
+    for name in [name for name in sys.modules if name.startswith("robot_descriptions.")]:
+        del sys.modules[name]
+
+
+def test_arms_of_robot_descriptions_are_loaded_but_never_downloaded(descriptions, tmp_path, monkeypatch):
+    forget(monkeypatch, tmp_path)
+    robot = load_arm("small")
+    assert (robot.name, robot.num_joints) == ("small", 4)
+    for name, words in (("away", "robot_descriptions pull away"), ("macro", "xacro"), ("nothing", "found 'nothing'")):
+        with pytest.raises(ArmError, match=words):
+            load_arm(name)
+
+
+def hollow(sides: int) -> LinkMesh:
+    """A box of thin walls, 20 cm high, of which as many sides are open."""
+    walls = [
+        trimesh.creation.box(size, trimesh.transformations.translation_matrix(at))
+        for size, at in (
+            ((0.1, 0.1, 0.002), (0, 0, 0.1)), ((0.1, 0.1, 0.002), (0, 0, -0.1)),
+            ((0.1, 0.002, 0.2), (0, 0.05, 0)), ((0.1, 0.002, 0.2), (0, -0.05, 0)),
+            ((0.002, 0.1, 0.2), (0.05, 0, 0)), ((0.002, 0.1, 0.2), (-0.05, 0, 0)),
+        )
+    ]  # fmt: skip
+    joined = trimesh.util.concatenate(walls[sides:])
+    return LinkMesh("box", 0, np.array(joined.vertices), np.array(joined.faces))
+
+
+def test_hollows_count_as_solid_unless_they_are_open_to_more_sides_than_one():
+    closed, open_to_one, open_to_two = (cover(hollow(sides), CoverSettings()) for sides in range(3))
+    for spheres in (closed, open_to_one):
+        assert spheres[:, 3].max() > 0.05  # in the middle
+    assert open_to_two[:, 3].max() < 0.02  # only the walls
+    assert len(open_to_two) > 3 * len(closed)
