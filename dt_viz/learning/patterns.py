@@ -1,10 +1,13 @@
 """Patterns of demonstrations: for each shape the motion and the clock of any start.
 
-The motion that a pattern predicts for a start is
+The motion that a pattern predicts for a start, which is `off` the mean start, is
 
-    c(u s_max) = mean(u) + u (start − mean(1)) + GP(start)(u),
+    c(u s_max) = mean(u) + g(u) off + GP(off)(u),
 
-its mean demonstration, an offset that fades, and a Gaussian process over the starts.
+its mean demonstration, an offset that fades, and a Gaussian process over the starts. How the offset fades, a power of
+u, and how much the starts explain is not known: several predictors are tried, each by what it makes of a demonstration
+that it has not seen, and their mean is taken, weighted by how likely that makes them. The trivial one, g(u) = u and
+nothing explained, is among them, and far from the starts g(u) is u.
 """
 
 from __future__ import annotations
@@ -44,7 +47,16 @@ class AugmentedSettings:
     width: float = 2.0
     """Width of the kernel over the starts, in spreads."""
     noise: float = 0.6
-    """Variance of shapes that the starts do not explain, relative to what they do."""
+    """Variance of shapes that the starts do not explain, relative to what they do, where `explained` is 1."""
+    explained: tuple[float, ...] = (0.0, 0.15, 0.4, 1.0, 2.5)
+    """Variances that starts explain, relative to that, which are tried; with 0 they explain nothing."""
+    fadings: tuple[float, ...] = (0.5, 0.7, 1.0, 1.4, 2.0)
+    """Powers of u by which an offset fades that are tried."""
+    reach: float = 4.0
+    """Distance from the mean start, in spreads, over which the fading that was learned becomes u."""
+    evidence: float = 4.0
+    """Number of independent deviations that a demonstration counts for when predictors are weighted: more than its
+    coordinates, fewer than its knots, whose deviations are alike."""
     time_noise: float = 1.0
     """Variance of clocks that the starts do not explain, relative to what they do."""
     time_width: float = 0.1
@@ -151,6 +163,10 @@ class Pattern:
     """Label of the demonstrations; None where their starts tell them from others."""
     mean: Array
     """(K, d) mean demonstration at the knots, from the start, metres."""
+    fading: Array
+    """(K,) part of an offset of the start that is left at the knots, for starts near the mean one."""
+    reach: float
+    """Distance of a start from the mean one over which that part becomes u, metres."""
     shapes: StartProcess
     """(K, d) offsets from the mean and its fading shift."""
     profile: Array
@@ -160,24 +176,25 @@ class Pattern:
     timing: StartProcess
     """(1 + P,) offsets from that logarithm, and from the profile."""
 
-    @property
-    def fading(self) -> Array:
-        """(K,) part of the phase that is left at the knots."""
-        return np.linspace(1.0, 0.0, len(self.mean))
-
     def points(self, start: Array) -> Array:
         """The predicted motion from a start (d,) at the knots, (K, d), metres."""
-        return self.mean + self.fading[:, None] * (start - self.mean[0]) + self.shapes.at(start)
+        off, u = start - self.mean[0], _phases(len(self.mean))
+        left = u + (self.fading - u) * _near(off, self.reach)
+        return self.mean + left[:, None] * off + self.shapes.at(start)
 
     def slopes(self, start: Array) -> Array:
         """The derivative (K, d, d) of these points with respect to the start (d,)."""
-        return self.shapes.slope_at(start) + self.fading[:, None, None] * np.eye(len(start))
+        off, u = start - self.mean[0], _phases(len(self.mean))[:, None, None]
+        beside = (self.fading[:, None, None] - u) * _near(off, self.reach)
+        eye = np.eye(len(off))
+        return self.shapes.slope_at(start) + u * eye + beside * (eye - np.outer(off, off) / self.reach**2)
 
     def placed(self, origin: Array, axes: Array, scale: float) -> Pattern:
         """The same in a space of more dimensions; see `dt_viz.learning.augmented.AugmentedImitation.placed`."""
         return replace(
             self,
             mean=origin + scale * self.mean @ axes.T,
+            reach=scale * self.reach,
             shapes=self.shapes.placed(origin, axes, scale, scale * axes.T),
             duration=self.duration - np.log(scale) / 2,
             timing=self.timing.placed(origin, axes, scale, np.eye(len(self.profile) + 1)),
@@ -205,15 +222,12 @@ def learn_patterns(
     timing = np.column_stack([paces, profiles])
     patterns = []
     for index in range(int(of.max()) + 1):
-        own, mean = of == index, points[of == index].mean(axis=0)
-        fading = np.linspace(1.0, 0.0, len(mean))[:, None]
-        shapes = points[own] - mean - fading * (points[own, :1] - mean[0])
+        own = of == index
         usual = timing[own].mean(axis=0)
         patterns.append(
             Pattern(
                 None if labels is None else labels[index],
-                mean,
-                StartProcess.of(starts[own], shapes, spread, settings.width, settings.noise),
+                *_predictor(points[own], spread, settings.knot_error * motions.extent, settings),
                 usual[1:],
                 float(usual[0]),
                 StartProcess.of(
@@ -228,6 +242,58 @@ def learn_patterns(
             )
         )
     return tuple(patterns)
+
+
+def _predictor(
+    points: Array, spread: float, least: float, settings: AugmentedSettings
+) -> tuple[Array, Array, float, StartProcess]:
+    """Mean, fading, its reach and shapes of a pattern: the mean of all predictors that are tried.
+
+    A predictor is ordinary kriging: what is left of the demonstrations without their fading offsets is an unknown mean
+    plus a Gaussian process over the starts. What it makes of each demonstration from the others is known in closed
+    form, and its likelihood falls with the mean of these errors.
+
+    Args:
+        points: (R, K, d) demonstrations at the knots, metres.
+        spread: of their starts, metres.
+        least: error that counts as none, metres.
+        settings: settings of the augmented state.
+    """
+    num, u, reach = len(points), _phases(points.shape[1]), settings.reach * spread
+    process = StartProcess.of(points[:, 0], points, spread, settings.width, settings.noise)
+    offsets = points[:, 0] - process.mean
+    near = _near(offsets, reach)
+    if num == 1:  # nothing is known of other starts
+        return points[0], u, reach, replace(process, coefficients=np.zeros_like(points))
+    found, logs = [], []
+    for explained in settings.explained:
+        gain = explained / settings.noise
+        inverse = np.linalg.inv(gain * process._kernel(process.known) + np.eye(num))
+        weights = inverse.sum(axis=0) / inverse.sum()  # of the demonstrations in the unknown mean
+        residual = inverse - np.outer(inverse.sum(axis=0), weights)
+        for power in settings.fadings:
+            fading = u**power
+            left = u + (fading - u) * near[:, None]
+            shapes = points - left[:, :, None] * offsets[:, None]
+            coefficients = np.tensordot(residual, shapes, 1)
+            errors = np.sqrt((coefficients**2).sum(axis=2).mean(axis=1)) / np.diag(residual)
+            logs.append(-settings.evidence * num * np.log(errors.mean() + least))
+            found.append((np.tensordot(weights, shapes, 1), fading, gain * coefficients))
+    likely = np.exp(np.array(logs) - max(logs))
+    mean, fading, coefficients = (
+        np.tensordot(likely / likely.sum(), np.stack(values), 1) for values in zip(*found, strict=True)
+    )
+    return mean, fading, reach, replace(process, coefficients=coefficients)
+
+
+def _phases(num: int) -> Array:
+    """u at `num` knots of a motion, from its start."""
+    return np.linspace(1.0, 0.0, num)
+
+
+def _near(offsets: Array, reach: float) -> Array:
+    """How near starts are that are `offsets` (*B, d) off the mean one, (*B,), from 1 there to 0 far away."""
+    return np.exp(-(offsets**2).sum(axis=-1) / (2 * reach**2))
 
 
 def patterns_of(points: Array, num: int) -> Indices:
