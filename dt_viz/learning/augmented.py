@@ -27,7 +27,7 @@ from dt_viz.flows.systems import Attractor, DiffeomorphicSystem, asinh_exp, log_
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.initial_guess import groups_of
 from dt_viz.learning.interface import AnyImitation, State
-from dt_viz.learning.patterns import AugmentedSettings, Pattern, learn_patterns, patterns_of, told_by_starts
+from dt_viz.learning.patterns import AugmentedSettings, Pattern, learn_patterns, patterns_of, set_apart, told_by_starts
 from dt_viz.learning.preparation import ImitationError, Motions, prepare
 from dt_viz.learning.timing import ARRIVED, TimedAttractor
 from dt_viz.metrics import arc_length
@@ -245,8 +245,12 @@ def _with_found_patterns(motions: Motions, settings: AugmentedSettings) -> tuple
     imitation = _with_patterns(motions, of, None, settings)
     told = told_by_starts(motions.starts, of, settings.min_apart * motions.extent)
     found = [(_missed(imitation, motions) if told else 1.0, imitation)]
-    while found[-1][0] > settings.max_missed and len(found) < settings.max_patterns:
-        of = patterns_of(points, len(found) + 1)
+    for num in range(2, min(settings.max_patterns, max(2, len(points) // 2)) + 1):
+        if found[-1][0] <= settings.max_missed:
+            break
+        of = patterns_of(points, num)
+        if not set_apart(points, of, settings.apart):
+            continue
         labels = [float(2 * index - of.max()) for index in range(of.max() + 1)]
         imitation = _with_patterns(motions, of, labels, settings)
         found.append((_missed(imitation, motions), imitation))

@@ -81,6 +81,9 @@ class AugmentedSettings:
     max_missed: float = 0.12
     """Largest Fréchet distance of a motion from its demonstration; with a larger one, more patterns are looked for.
     Handwriting of one pattern stays below 9 %."""
+    apart: float = 2.0
+    """Least distance of demonstrations of different patterns, relative to the largest one within a pattern: scatter that
+    is large, but has no gaps, is one pattern. There are at most half as many as demonstrations, or two."""
     min_apart: float = 0.01
     """Least distance of the starts of different patterns that tells these apart; nearer to each other, what is followed
     would hang on how a start is rounded, so that labels tell them."""
@@ -287,7 +290,7 @@ def _predictor(
 
 
 def _phases(num: int) -> Array:
-    """u at `num` knots of a motion, from its start."""
+    """The part u of the phase that is left at `num` knots of a motion, from its start."""
     return np.linspace(1.0, 0.0, num)
 
 
@@ -306,9 +309,27 @@ def patterns_of(points: Array, num: int) -> Indices:
     Returns:
         (R,) index of the pattern of each, in the order in which patterns come first.
     """
-    groups = groups_of(points - np.linspace(1.0, 0.0, points.shape[1])[:, None] * points[:, :1], num)
+    groups = groups_of(_without_start(points), num)
     first = list(dict.fromkeys(groups))
     return np.array([first.index(group) for group in groups])
+
+
+def set_apart(points: Array, of: Indices, least: float) -> bool:
+    """Whether different patterns differ `least` times as much as what is of one pattern does, wherever motions begin.
+
+    Args:
+        points: (R, n, d), evenly along each.
+        of: (R,) index of the pattern of each.
+        least: see `AugmentedSettings.apart`.
+    """
+    shapes = _without_start(points)
+    apart, same = np.linalg.norm(shapes[:, None] - shapes, axis=-1).mean(axis=-1), of[:, None] == of
+    return bool(apart[~same].min(initial=np.inf) >= least * apart[same].max())
+
+
+def _without_start(points: Array) -> Array:
+    """Motions (R, n, d) without an offset of their starts that fades."""
+    return points - _phases(points.shape[1])[:, None] * points[:, :1]
 
 
 def told_by_starts(starts: Array, of: Indices, least: float) -> bool:
