@@ -35,13 +35,13 @@ class AugmentedSettings:
     """s_max: what the phase counts beside a distance of places."""
     power: float = 3.0
     """p of the base system: with a large one, what leads off the motion fades early."""
-    min_knots: int = 30
+    min_knots: int = 120
     """Smallest number of knots of a predicted motion."""
-    max_knots: int = 240
+    max_knots: int = 480
     """Largest number of knots."""
     knot_error: float = 0.003
-    """Mean distance of a demonstration from the curve through its knots up to which these are enough; handwriting stays
-    below 0.1 % with 30."""
+    """Mean distance of a demonstration from the curve through its knots up to which these are enough, and least
+    deviation of demonstrations that predictors are told apart by."""
     min_spread: float = 0.04
     """Smallest spread that is reckoned with: starts nearer to each other teach nothing of what they do."""
     width: float = 2.0
@@ -82,8 +82,8 @@ class AugmentedSettings:
     """Largest Fréchet distance of a motion from its demonstration; with a larger one, more patterns are looked for.
     Handwriting of one pattern stays below 9 %."""
     apart: float = 2.0
-    """Least distance of demonstrations of different patterns, relative to the largest one within a pattern: scatter that
-    is large, but has no gaps, is one pattern. There are at most half as many as demonstrations, or two."""
+    """Least distance of demonstrations of different patterns, relative to the largest one within a pattern: scatter
+    without gaps is one pattern, however large. There are at most half as many patterns as demonstrations, or two."""
     min_apart: float = 0.01
     """Least distance of the starts of different patterns that tells these apart; nearer to each other, what is followed
     would hang on how a start is rounded, so that labels tell them."""
