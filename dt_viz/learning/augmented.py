@@ -211,7 +211,7 @@ def fit_augmented(
     if given is not None:
         known, of = np.unique([given[number] for number in motions.numbers], return_inverse=True)
         imitation = _with_patterns(motions, of, known.tolist(), settings)
-        off = missed_by(imitation, motions)
+        off = _missed(imitation, motions)
     else:
         imitation, off = with_found_patterns(motions, settings)
         if imitation.known_labels:
@@ -244,7 +244,7 @@ def with_found_patterns(motions: Motions, settings: AugmentedSettings) -> tuple[
     of = groups_of(points / motions.spread)
     imitation = _with_patterns(motions, of, None, settings)
     told = told_by_starts(motions.starts, of, settings.min_apart * motions.extent)
-    found = [(missed_by(imitation, motions) if told else 1.0, imitation)]
+    found = [(_missed(imitation, motions) if told else 1.0, imitation)]
     for num in range(2, min(settings.max_patterns, max(2, len(points) // 2)) + 1):
         if found[-1][0] <= settings.max_missed:
             break
@@ -253,7 +253,7 @@ def with_found_patterns(motions: Motions, settings: AugmentedSettings) -> tuple[
             continue
         labels = [float(2 * index - of.max()) for index in range(of.max() + 1)]
         imitation = _with_patterns(motions, of, labels, settings)
-        found.append((missed_by(imitation, motions), imitation))
+        found.append((_missed(imitation, motions), imitation))
     off, imitation = min(found, key=lambda each: each[0])
     return imitation, off
 
@@ -278,7 +278,7 @@ def _with_patterns(
     )
 
 
-def missed_by(imitation: AugmentedImitation, motions: Motions) -> float:
+def _missed(imitation: AugmentedImitation, motions: Motions) -> float:
     """How far the motions of their own patterns are from demonstrations; see `Motions.missed_by`."""
     states = imitation.states(motions.starts)
     states[:, -1] = imitation.pattern_of

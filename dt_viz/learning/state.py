@@ -6,7 +6,7 @@
     it remembers its phase and where it began (see `dt_viz.learning.augmented`): it crosses, comes back and winds, and
     draws the figure from other starts, too;
 ``auto``
-    plain where that draws the demonstrations, and those that are left out, about as well as the augmented one does: in
+    plain where that draws the demonstrations, and those that are left out about as well as the augmented one does: in
     a few folds some are held out, and followed by what the others teach. One or two are too few to leave some out.
     The choice is made by fits with the default settings: who chooses fewer layers, or another objective, sees what
     these make of the plain motion.
@@ -22,7 +22,7 @@ import numpy as np
 
 from dt_viz.flows.fields import Array
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
-from dt_viz.learning.augmented import fit_augmented, missed_by, with_found_patterns
+from dt_viz.learning.augmented import fit_augmented, with_found_patterns
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.imitation import Imitation, ImitationSettings, Progress, fit, fit_transform
 from dt_viz.learning.interface import STATES, AnyImitation, Choice, State
@@ -92,7 +92,6 @@ def learn(
         return fit_augmented(demonstrations, labels, augmented)
     choice, augmented = choice or ChoiceSettings(), augmented or AugmentedSettings()
     motions, found, begun = prepare(demonstrations), None, 0.0
-    remembering = fit_augmented(demonstrations, None, augmented)
     if len(motions.numbers) >= choice.fewest:
         begun = choice.part
         found = leaving_out(motions, choice, augmented, lambda done, message: progress(begun * done, message))
@@ -100,11 +99,11 @@ def learn(
         reason = f"it is nearer to what it has not learned from ({found})"
     else:
         plain = cache(lambda settings: given(settings, lambda d, message: progress(begun + (1 - begun) * d, message)))
-        reason = _why_not(motions, plain, missed_by(remembering, motions))
+        reason = _why_not(motions, plain)
         if not reason:
             return replace(plain(settings), choice=found)
     progress(1.0, "done")
-    return replace(remembering, reason=reason, choice=found)
+    return replace(fit_augmented(demonstrations, None, augmented, reason), choice=found)
 
 
 def leaving_out(motions: Motions, choice: ChoiceSettings, augmented: AugmentedSettings, progress: Progress) -> Choice:
@@ -123,7 +122,7 @@ def leaving_out(motions: Motions, choice: ChoiceSettings, augmented: AugmentedSe
     for fold in range(folds):
         held = by_length[fold::folds]
         others, known = motions.only(np.setdiff1d(by_length, held)), motions.only(held)
-        part = lambda done, message, fold=fold: progress((fold + done) / folds, f"leaving some out: {message}")  # noqa: E731
+        part = lambda done, message, fold=fold: progress((fold + done) / folds, f"some are left out: {message}")  # noqa: E731
         distances = _plain(others, known, choice.iterations, part), _augmented(others, known, augmented)
         off = np.concatenate([off, [*distances, _mean(others, known)]], axis=1)
         plain, remembering, shifted = off.mean(axis=1)
@@ -155,15 +154,12 @@ def _mean(others: Motions, known: Motions) -> Array:
     return discrete_frechet(mean + left * (wanted[:, :1] - mean[0]), wanted)
 
 
-def _why_not(motions: Motions, plain: Callable[[ImitationSettings], Imitation], otherwise: float) -> str:
-    """Why a plain fit with the default settings does not do; empty where it draws the motions.
-
-    It may miss them by as much as the augmented state does `otherwise`, relative to the extent.
-    """
+def _why_not(motions: Motions, plain: Callable[[ImitationSettings], Imitation]) -> str:
+    """Why a plain fit with the default settings does not do; empty where it draws the motions."""
     settings = ImitationSettings()
     try:
         off = motions.missed_by(plain(settings).system, motions.starts)
     except ImitationError as error:
         return f"the plain state fails: {error}"
     missed = f"the plain state misses a demonstration by {100 * off:.0f} % of the extent"
-    return missed if off > max(settings.max_missed, otherwise) else ""
+    return missed if off > settings.max_missed else ""
