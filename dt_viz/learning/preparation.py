@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from dt_viz.errors import FormatError
-from dt_viz.flows.fields import Array
+from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.demonstrations import Demonstration, samples_of
 from dt_viz.metrics import arc_length, discrete_frechet, resample_by_arc_length
@@ -93,7 +93,7 @@ class Motions:
         """Resample all motions at `num` points equally spaced along each, (R, num, d)."""
         return np.stack([resample_by_arc_length(path, num) for path in self.positions])
 
-    def only(self, which: Sequence[int]) -> Motions:
+    def only(self, which: Indices) -> Motions:
         """Some of these motions, by their places among these."""
         chosen = {
             name: tuple(getattr(self, name)[k] for k in which) for name in ("numbers", "names", "times", "positions")

@@ -125,10 +125,10 @@ def leaving_out(motions: Motions, choice: ChoiceSettings, augmented: AugmentedSe
         part = lambda done, message, fold=fold: progress((fold + done) / folds, f"some are left out: {message}")  # noqa: E731
         distances = _plain(others, known, choice.iterations, part), _augmented(others, known, augmented)
         off = np.concatenate([off, [*distances, _mean(others, known)]], axis=1)
-        plain, remembering, shifted = off.mean(axis=1)
-        if plain > choice.hopeless * remembering:
+        if off[0].mean() > choice.hopeless * off[1].mean():
             break
-    return Choice(float(plain), float(remembering), float(shifted), off.shape[1])
+    plain, remembering, shifted = (float(distance) for distance in off.mean(axis=1))
+    return Choice(plain, remembering, shifted, off.shape[1])
 
 
 def _plain(others: Motions, known: Motions, iterations: int, progress: Progress) -> Array:
