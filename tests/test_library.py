@@ -17,12 +17,12 @@ from dt_viz.warning import Kind
 
 @pytest.fixture(scope="module")
 def push() -> Motion:
-    return dt.fit(dt.load_demonstrations(ASSETS / "push_box.npz"))
+    return dt.fit(dt.load_demonstrations(ASSETS / "push_box.npz"), state="plain")
 
 
 @pytest.fixture(scope="module")
 def letter() -> Motion:
-    return dt.fit(dt.load_demonstrations(ASSETS / "draw_s.npz"))
+    return dt.fit(dt.load_demonstrations(ASSETS / "draw_s.npz"), state="plain")
 
 
 BALL = dt.Sphere((0.10, -0.53, 0.15), diameter=0.15)

@@ -37,6 +37,8 @@ class Followed:
     """A demonstration that was held out, and what it is followed by."""
 
     demonstration: Demonstration
+    state: str
+    """State in which the motion that follows it was learned."""
     paths: Mapping[str, Array]
     """(T, d), metres, of each of `WAYS`."""
     times: Mapping[str, Array]
@@ -83,6 +85,7 @@ def follow(demonstrations: Sequence[Demonstration], learn: Learn, folds: int) ->
             by_way = dict(zip(WAYS, ways, strict=True))
             followed[i] = Followed(
                 demonstrations[i],
+                imitation.state,
                 {way: path for way, (path, _) in by_way.items()},
                 {way: times for way, (_, times) in by_way.items()},
             )

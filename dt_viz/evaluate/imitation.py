@@ -30,6 +30,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from statistics import geometric_mean
 from typing import Any
 
 import numpy as np
@@ -41,12 +42,12 @@ from dt_viz.evaluate.options import InputError, ready_folder, report, whole_numb
 from dt_viz.flows.diffeomorphisms import min_det_jacobian, round_trip_error
 from dt_viz.flows.fields import Array
 from dt_viz.learning.demonstrations import METRES_PER_LASA_UNIT, Demonstration, load_demonstrations
-from dt_viz.learning.imitation import OBJECTIVES, ImitationError, ImitationSettings, fit, grown_grid
+from dt_viz.learning.imitation import OBJECTIVES, ImitationError, ImitationSettings, grown_grid
 from dt_viz.learning.interface import AnyImitation
 from dt_viz.learning.state import learn as learn_in_state
 from dt_viz.metrics import rms_at_equal_times
 
-STATES = ("plain", "augmented")
+STATES = ("plain", "augmented", "auto")
 
 
 @dataclass(frozen=True)
@@ -100,9 +101,7 @@ def run(options: argparse.Namespace) -> int:
     """Run the command; 2 if one of the shapes could not be fitted."""
     if options.state == "augmented" and options.objective != OBJECTIVES[0]:
         raise InputError("--objective", options.objective, "none with --state augmented, whose fit has no objective")
-    learn: Learn = partial(learn_in_state, state="augmented")
-    if options.state == "plain":
-        learn = partial(fit, settings=ImitationSettings(options.objective))
+    learn: Learn = partial(learn_in_state, settings=ImitationSettings(options.objective), state=options.state)
     sources, holds_out = _sources(options.files), options.leave_one_out or options.folds is not None
     alone = ", ".join(str(source.path) for source in sources if len(source.demonstrations) == 1)
     if holds_out and alone:
@@ -121,6 +120,8 @@ def run(options: argparse.Namespace) -> int:
         except ImitationError as error:
             print(f"{source.path}: {error}", file=sys.stderr)
             continue
+        if imitation.choice is not None:
+            print(f"{name}: {imitation.state}. {imitation.choice}")
         for warning in imitation.warnings:
             print(f"{source.path}: {warning}", file=sys.stderr)
         row, arrays, rollouts = measured(imitation, source, seconds)
@@ -137,10 +138,7 @@ def run(options: argparse.Namespace) -> int:
         report(_with_means(shapes))
         print(f"fit, median: {np.median([row.fit_seconds for row in rows]):.2f} s")
         if holds_out:
-            print("\nheld out: each demonstration against what was learned from the others")
-            report(_with_means(held_out))
-            better = sum(row["learned_mm"] < min(row["mean_mm"], row["nearest_mm"]) for row in held_out)
-            print(f"nearer than both without learning: {better} of {len(held_out)}")
+            _report_held_out(held_out)
         chosen = {"state": options.state, "objective": options.objective}
         write_json(folder / "figures.json", {**chosen, "shapes": shapes, "held_out": held_out})
         if figures.can_draw():
@@ -149,6 +147,18 @@ def run(options: argparse.Namespace) -> int:
                 worst = [panel for _, panel in worst_of(cases)]
                 figures.save(figures.panels(worst, columns=3), folder / "worst.png")
     return 0 if len(rows) == len(sources) else 2
+
+
+def _report_held_out(rows: Sequence[dict[str, Any]]) -> None:
+    """Print the rows of `summed_up`, and how often and how far what was learned is nearer than what takes none."""
+    print("\nheld out: each demonstration against what was learned from the others")
+    report(_with_means(rows))
+    better, of_mean = (
+        (row["learned_mm"] < min(row["mean_mm"], row["nearest_mm"]) for row in rows),
+        [row["of_mean"] for row in rows],
+    )
+    print(f"nearer than both without learning: {sum(better)} of {len(rows)}")
+    print(f"relative to the mean, shifted: {geometric_mean(of_mean):.3f} (geometric mean), {max(of_mean):.3f} at worst")
 
 
 def measured(
@@ -223,10 +233,16 @@ def _arrays(followed: Sequence[Followed], unit: float) -> dict[str, Array]:
 
 
 def summed_up(name: str, folds: int, followed: Sequence[Followed]) -> dict[str, Any]:
-    """Means over the held-out demonstrations of a shape, mm: Fréchet distance and distance at equal times."""
+    """Means over the held-out demonstrations of a shape, mm: Fréchet distance and distance at equal times.
+
+    ``of_mean`` is the Fréchet distance of what was learned relative to that of the mean, shifted, and ``plain`` the
+    part of the demonstrations that was followed in the plain state.
+    """
     distances = {f"{way}_mm": 1e3 * float(np.mean([f.frechet(way) for f in followed])) for way in WAYS}
     rms = {f"{way}_rms_mm": 1e3 * float(np.mean([f.rms(way) for f in followed])) for way in WAYS}
-    return {"name": name, "folds": folds, **distances, **rms}
+    plain = float(np.mean([f.state == "plain" for f in followed]))
+    of_mean = distances["learned_mm"] / distances["mean_mm"]
+    return {"name": name, "folds": folds, **distances, "of_mean": of_mean, "plain": plain, **rms}
 
 
 def cases_of(name: str, source: Source, followed: Sequence[Followed]) -> list[tuple[float, FigurePanel]]:

@@ -20,7 +20,7 @@ def main(file: str | None = None) -> None:
 
     # %% Learn
     demonstrations = dt.load_demonstrations(ASSETS / "draw_s.npz")
-    motion = dt.fit(demonstrations)
+    motion = dt.fit(demonstrations, state="plain")  # one velocity field, which is plotted
 
     # %% A ball in the middle of the first path
     path = motion.rollouts()[0].positions

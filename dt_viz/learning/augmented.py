@@ -27,7 +27,7 @@ from dt_viz.flows.systems import Attractor, DiffeomorphicSystem, asinh_exp, log_
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.initial_guess import groups_of
 from dt_viz.learning.interface import AnyImitation, State
-from dt_viz.learning.patterns import AugmentedSettings, Pattern, learn_patterns, patterns_of, told_by_starts
+from dt_viz.learning.patterns import AugmentedSettings, Pattern, learn_patterns, patterns_of, set_apart, told_by_starts
 from dt_viz.learning.preparation import ImitationError, Motions, prepare
 from dt_viz.learning.timing import ARRIVED, TimedAttractor
 from dt_viz.metrics import arc_length
@@ -213,7 +213,7 @@ def fit_augmented(
         imitation = _with_patterns(motions, of, known.tolist(), settings)
         off = _missed(imitation, motions)
     else:
-        imitation, off = _with_found_patterns(motions, settings)
+        imitation, off = with_found_patterns(motions, settings)
         if imitation.known_labels:
             of_number = dict(zip(imitation.numbers, imitation.pattern_of, strict=True))
             given = tuple(imitation.patterns[of_number.get(k, 0)].label or 0.0 for k in range(len(demonstrations)))
@@ -238,15 +238,19 @@ def _checked(labels: Sequence[float], num: int) -> tuple[float, ...]:
     return tuple(float(label) for label in labels)
 
 
-def _with_found_patterns(motions: Motions, settings: AugmentedSettings) -> tuple[AugmentedImitation, float]:
-    """Learn motions with the fewest patterns that draw them, and how far off they are; see `_missed`."""
+def with_found_patterns(motions: Motions, settings: AugmentedSettings) -> tuple[AugmentedImitation, float]:
+    """Learn motions with the fewest patterns that draw them, and how far off they are; see `Motions.missed_by`."""
     points = motions.resampled() - motions.goal
     of = groups_of(points / motions.spread)
     imitation = _with_patterns(motions, of, None, settings)
     told = told_by_starts(motions.starts, of, settings.min_apart * motions.extent)
     found = [(_missed(imitation, motions) if told else 1.0, imitation)]
-    while found[-1][0] > settings.max_missed and len(found) < settings.max_patterns:
-        of = patterns_of(points, len(found) + 1)
+    for num in range(2, min(settings.max_patterns, max(2, len(points) // 2)) + 1):
+        if found[-1][0] <= settings.max_missed:
+            break
+        of = patterns_of(points, num)
+        if not set_apart(points, of, settings.apart):
+            continue
         labels = [float(2 * index - of.max()) for index in range(of.max() + 1)]
         imitation = _with_patterns(motions, of, labels, settings)
         found.append((_missed(imitation, motions), imitation))

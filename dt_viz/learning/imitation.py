@@ -217,7 +217,6 @@ def fit(
     began = time.perf_counter()
     progress(0.0, "checking the demonstrations")
     motions = prepare(demonstrations, settings.preparation)
-    fit_transform = _fit_trajectories if settings.objective == "trajectory" else _fit_velocities
     transform = fit_transform(motions, settings, progress)
 
     progress(0.92, "learning the timing")
@@ -245,6 +244,12 @@ def fit(
         )
     progress(1.0, "done")
     return result
+
+
+def fit_transform(motions: Motions, settings: ImitationSettings, progress: Progress) -> Chain:
+    """Fit ψ alone, without the timing and the certificates; see `fit`."""
+    fit_objective = _fit_trajectories if settings.objective == "trajectory" else _fit_velocities
+    return fit_objective(motions, settings, progress)
 
 
 def _fit_trajectories(motions: Motions, settings: ImitationSettings, progress: Progress) -> Chain:

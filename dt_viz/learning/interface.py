@@ -16,6 +16,26 @@ State = Literal["auto", "plain", "augmented"]
 STATES: tuple[State, ...] = get_args(State)
 
 
+@dataclass(frozen=True)
+class Choice:
+    """How far demonstrations that were left out are from what the others teach: mean Fréchet distances, metres."""
+
+    plain: float
+    """In the plain state; infinite where that fails."""
+    augmented: float
+    shifted_mean: float
+    """Of the mean of the others, shifted to the start by an offset that fades: what takes no learning."""
+    num: int
+    """Number of demonstrations that were left out, before it was clear."""
+
+    def __str__(self) -> str:
+        off = ", ".join(
+            f"{state} {1e3 * distance:.1f} mm ({distance / self.shifted_mean:.2f} × the shifted mean)"
+            for state, distance in (("plain", self.plain), ("augmented", self.augmented))
+        )
+        return f"{self.num} demonstrations left out: {off}"
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AnyImitation(ABC):
     """A learned motion, in the demonstrations' own units."""
@@ -30,6 +50,8 @@ class AnyImitation(ABC):
     warnings: tuple[str, ...] = ()
     reason: str = ""
     """Why it was learned in this state, where that was not asked for; see `dt_viz.learning.state`."""
+    choice: Choice | None = None
+    """What it was chosen by, where that was done by leaving demonstrations out."""
     labels: tuple[float, ...] | None = None
     """Label of each demonstration that was given; None without labels."""
     augmented: AugmentedSettings = field(default_factory=AugmentedSettings)

@@ -1,10 +1,13 @@
 """Patterns of demonstrations: for each shape the motion and the clock of any start.
 
-The motion that a pattern predicts for a start is
+The motion that a pattern predicts for a start, which is `off` the mean start, is
 
-    c(u s_max) = mean(u) + u (start − mean(1)) + GP(start)(u),
+    c(u s_max) = mean(u) + g(u) off + GP(off)(u),
 
-its mean demonstration, an offset that fades, and a Gaussian process over the starts.
+its mean demonstration, an offset that fades, and a Gaussian process over the starts. How the offset fades, a power of
+u, and how much the starts explain is not known: several predictors are tried, each by what it makes of a demonstration
+that it has not seen, and their mean is taken, weighted by how likely that makes them. The trivial one, g(u) = u and
+nothing explained, is among them, and far from the starts g(u) is u.
 """
 
 from __future__ import annotations
@@ -32,19 +35,28 @@ class AugmentedSettings:
     """s_max: what the phase counts beside a distance of places."""
     power: float = 3.0
     """p of the base system: with a large one, what leads off the motion fades early."""
-    min_knots: int = 30
+    min_knots: int = 120
     """Smallest number of knots of a predicted motion."""
-    max_knots: int = 240
+    max_knots: int = 480
     """Largest number of knots."""
     knot_error: float = 0.003
-    """Mean distance of a demonstration from the curve through its knots up to which these are enough; handwriting stays
-    below 0.1 % with 30."""
+    """Mean distance of a demonstration from the curve through its knots up to which these are enough, and least
+    deviation of demonstrations that predictors are told apart by."""
     min_spread: float = 0.04
     """Smallest spread that is reckoned with: starts nearer to each other teach nothing of what they do."""
     width: float = 2.0
     """Width of the kernel over the starts, in spreads."""
     noise: float = 0.6
-    """Variance of shapes that the starts do not explain, relative to what they do."""
+    """Variance of shapes that the starts do not explain, relative to what they do, where `explained` is 1."""
+    explained: tuple[float, ...] = (0.0, 0.15, 0.4, 1.0, 2.5)
+    """Variances that starts explain, relative to that, which are tried; with 0 they explain nothing."""
+    fadings: tuple[float, ...] = (0.5, 0.7, 1.0, 1.4, 2.0)
+    """Powers of u by which an offset fades that are tried."""
+    reach: float = 4.0
+    """Distance from the mean start, in spreads, over which the fading that was learned becomes u."""
+    evidence: float = 4.0
+    """Number of independent deviations that a demonstration counts for when predictors are weighted: more than its
+    coordinates, fewer than its knots, whose deviations are alike."""
     time_noise: float = 1.0
     """Variance of clocks that the starts do not explain, relative to what they do."""
     time_width: float = 0.1
@@ -69,6 +81,9 @@ class AugmentedSettings:
     max_missed: float = 0.12
     """Largest Fréchet distance of a motion from its demonstration; with a larger one, more patterns are looked for.
     Handwriting of one pattern stays below 9 %."""
+    apart: float = 2.0
+    """Least distance of demonstrations of different patterns, relative to the largest one within a pattern: scatter
+    without gaps is one pattern, however large. There are at most half as many patterns as demonstrations, or two."""
     min_apart: float = 0.01
     """Least distance of the starts of different patterns that tells these apart; nearer to each other, what is followed
     would hang on how a start is rounded, so that labels tell them."""
@@ -151,6 +166,10 @@ class Pattern:
     """Label of the demonstrations; None where their starts tell them from others."""
     mean: Array
     """(K, d) mean demonstration at the knots, from the start, metres."""
+    fading: Array
+    """(K,) part of an offset of the start that is left at the knots, for starts near the mean one."""
+    reach: float
+    """Distance of a start from the mean one over which that part becomes u, metres."""
     shapes: StartProcess
     """(K, d) offsets from the mean and its fading shift."""
     profile: Array
@@ -160,24 +179,25 @@ class Pattern:
     timing: StartProcess
     """(1 + P,) offsets from that logarithm, and from the profile."""
 
-    @property
-    def fading(self) -> Array:
-        """(K,) part of the phase that is left at the knots."""
-        return np.linspace(1.0, 0.0, len(self.mean))
-
     def points(self, start: Array) -> Array:
         """The predicted motion from a start (d,) at the knots, (K, d), metres."""
-        return self.mean + self.fading[:, None] * (start - self.mean[0]) + self.shapes.at(start)
+        off, u = start - self.mean[0], _phases(len(self.mean))
+        left = u + (self.fading - u) * _near(off, self.reach)
+        return self.mean + left[:, None] * off + self.shapes.at(start)
 
     def slopes(self, start: Array) -> Array:
         """The derivative (K, d, d) of these points with respect to the start (d,)."""
-        return self.shapes.slope_at(start) + self.fading[:, None, None] * np.eye(len(start))
+        off, u = start - self.mean[0], _phases(len(self.mean))[:, None, None]
+        beside = (self.fading[:, None, None] - u) * _near(off, self.reach)
+        eye = np.eye(len(off))
+        return self.shapes.slope_at(start) + u * eye + beside * (eye - np.outer(off, off) / self.reach**2)
 
     def placed(self, origin: Array, axes: Array, scale: float) -> Pattern:
         """The same in a space of more dimensions; see `dt_viz.learning.augmented.AugmentedImitation.placed`."""
         return replace(
             self,
             mean=origin + scale * self.mean @ axes.T,
+            reach=scale * self.reach,
             shapes=self.shapes.placed(origin, axes, scale, scale * axes.T),
             duration=self.duration - np.log(scale) / 2,
             timing=self.timing.placed(origin, axes, scale, np.eye(len(self.profile) + 1)),
@@ -205,15 +225,12 @@ def learn_patterns(
     timing = np.column_stack([paces, profiles])
     patterns = []
     for index in range(int(of.max()) + 1):
-        own, mean = of == index, points[of == index].mean(axis=0)
-        fading = np.linspace(1.0, 0.0, len(mean))[:, None]
-        shapes = points[own] - mean - fading * (points[own, :1] - mean[0])
+        own = of == index
         usual = timing[own].mean(axis=0)
         patterns.append(
             Pattern(
                 None if labels is None else labels[index],
-                mean,
-                StartProcess.of(starts[own], shapes, spread, settings.width, settings.noise),
+                *_predictor(points[own], spread, settings.knot_error * motions.extent, settings),
                 usual[1:],
                 float(usual[0]),
                 StartProcess.of(
@@ -230,6 +247,58 @@ def learn_patterns(
     return tuple(patterns)
 
 
+def _predictor(
+    points: Array, spread: float, least: float, settings: AugmentedSettings
+) -> tuple[Array, Array, float, StartProcess]:
+    """Mean, fading, its reach and shapes of a pattern: the mean of all predictors that are tried.
+
+    A predictor is ordinary kriging: what is left of the demonstrations without their fading offsets is an unknown mean
+    plus a Gaussian process over the starts. What it makes of each demonstration from the others is known in closed
+    form, and its likelihood falls with the mean of these errors.
+
+    Args:
+        points: (R, K, d) demonstrations at the knots, metres.
+        spread: of their starts, metres.
+        least: error that counts as none, metres.
+        settings: settings of the augmented state.
+    """
+    num, u, reach = len(points), _phases(points.shape[1]), settings.reach * spread
+    process = StartProcess.of(points[:, 0], points, spread, settings.width, settings.noise)
+    offsets = points[:, 0] - process.mean
+    near = _near(offsets, reach)
+    if num == 1:  # nothing is known of other starts
+        return points[0], u, reach, replace(process, coefficients=np.zeros_like(points))
+    found, logs = [], []
+    for explained in settings.explained:
+        gain = explained / settings.noise
+        inverse = np.linalg.inv(gain * process._kernel(process.known) + np.eye(num))
+        weights = inverse.sum(axis=0) / inverse.sum()  # of the demonstrations in the unknown mean
+        residual = inverse - np.outer(inverse.sum(axis=0), weights)
+        for power in settings.fadings:
+            fading = u**power
+            left = u + (fading - u) * near[:, None]
+            shapes = points - left[:, :, None] * offsets[:, None]
+            coefficients = np.tensordot(residual, shapes, 1)
+            errors = np.sqrt((coefficients**2).sum(axis=2).mean(axis=1)) / np.diag(residual)
+            logs.append(-settings.evidence * num * np.log(errors.mean() + least))
+            found.append((np.tensordot(weights, shapes, 1), fading, gain * coefficients))
+    likely = np.exp(np.array(logs) - max(logs))
+    mean, fading, coefficients = (
+        np.tensordot(likely / likely.sum(), np.stack(values), 1) for values in zip(*found, strict=True)
+    )
+    return mean, fading, reach, replace(process, coefficients=coefficients)
+
+
+def _phases(num: int) -> Array:
+    """The part u of the phase that is left at `num` knots of a motion, from its start."""
+    return np.linspace(1.0, 0.0, num)
+
+
+def _near(offsets: Array, reach: float) -> Array:
+    """How near starts are that are `offsets` (*B, d) off the mean one, (*B,), from 1 there to 0 far away."""
+    return np.exp(-(offsets**2).sum(axis=-1) / (2 * reach**2))
+
+
 def patterns_of(points: Array, num: int) -> Indices:
     """Tell motions apart by their shapes, wherever they begin.
 
@@ -240,9 +309,27 @@ def patterns_of(points: Array, num: int) -> Indices:
     Returns:
         (R,) index of the pattern of each, in the order in which patterns come first.
     """
-    groups = groups_of(points - np.linspace(1.0, 0.0, points.shape[1])[:, None] * points[:, :1], num)
+    groups = groups_of(_without_start(points), num)
     first = list(dict.fromkeys(groups))
     return np.array([first.index(group) for group in groups])
+
+
+def set_apart(points: Array, of: Indices, least: float) -> bool:
+    """Whether different patterns differ `least` times as much as what is of one pattern does, wherever motions begin.
+
+    Args:
+        points: (R, n, d), evenly along each.
+        of: (R,) index of the pattern of each.
+        least: see `AugmentedSettings.apart`.
+    """
+    shapes = _without_start(points)
+    apart, same = np.linalg.norm(shapes[:, None] - shapes, axis=-1).mean(axis=-1), of[:, None] == of
+    return bool(apart[~same].min(initial=np.inf) >= least * apart[same].max())
+
+
+def _without_start(points: Array) -> Array:
+    """Motions (R, n, d) without an offset of their starts that fades."""
+    return points - _phases(points.shape[1])[:, None] * points[:, :1]
 
 
 def told_by_starts(starts: Array, of: Indices, least: float) -> bool:

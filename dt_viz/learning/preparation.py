@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from dt_viz.errors import FormatError
-from dt_viz.flows.fields import Array
+from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.demonstrations import Demonstration, samples_of
 from dt_viz.metrics import arc_length, discrete_frechet, resample_by_arc_length
@@ -93,8 +93,19 @@ class Motions:
         """Resample all motions at `num` points equally spaced along each, (R, num, d)."""
         return np.stack([resample_by_arc_length(path, num) for path in self.positions])
 
+    def only(self, which: Indices) -> Motions:
+        """Some of these motions, by their places among these."""
+        chosen = {
+            name: tuple(getattr(self, name)[k] for k in which) for name in ("numbers", "names", "times", "positions")
+        }
+        return replace(self, **chosen)
+
     def missed_by(self, system: DiffeomorphicSystem, states: Array) -> float:
-        """Largest discrete Fréchet distance of a system's motions from these, relative to the extent.
+        """Largest discrete Fréchet distance of a system's motions from these, relative to the extent."""
+        return float(self.distances(system, states).max()) / self.extent
+
+    def distances(self, system: DiffeomorphicSystem, states: Array) -> Array:
+        """Discrete Fréchet distances (R,) of a system's motions from these.
 
         Args:
             system: of states, the first d coordinates of which are a place.
@@ -104,7 +115,7 @@ class Motions:
         z = system.base.at_fraction(system.transform.forward(states), np.linspace(1.0, 0.0, wanted.shape[1]))
         paths = system.transform.inverse(z)[..., : wanted.shape[2]]
         found = np.stack([resample_by_arc_length(path, wanted.shape[1]) for path in paths])
-        return float(discrete_frechet(found, wanted).max()) / self.extent
+        return discrete_frechet(found, wanted)
 
 
 def prepare(demonstrations: Sequence[Demonstration], settings: PreparationSettings | None = None) -> Motions:

@@ -58,8 +58,8 @@ class FitStore:
 
         What is learned in the augmented state is not stored: it takes milliseconds.
         """
-        plain = lambda settings: self.get(demonstrations, settings, progress)  # noqa: E731
-        return learn(demonstrations, settings, state, plain=plain)
+        plain = lambda settings, progress: self.get(demonstrations, settings, progress)  # noqa: E731
+        return learn(demonstrations, settings, state, progress=progress, plain=plain)
 
     def get(
         self,

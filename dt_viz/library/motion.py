@@ -278,8 +278,8 @@ def fit(
         objective: what is fitted in the plain state: the motions, or their velocities as in eq. (3).
         state: "plain" is the paper's: one vector field of places, which needs no memory. "augmented" remembers its
             phase and where it began: it crosses itself, comes back, winds, and draws the figure from other starts,
-            too. "auto" is plain unless a fit with the default settings misses a demonstration by more than 5 % of their
-            extent.
+            too. "auto" is plain where a fit with the default settings misses no demonstration by more than 5 % of their
+            extent and, with three or more, follows those that are left out about as well as the augmented state.
         labels: a number for each demonstration, where they differ although they begin at one place: those with one
             number are of one pattern; makes the state augmented. None finds them where that is so; see `Motion.labels`.
         settings: of the plain fit, the objective included; None takes the defaults.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -12,7 +12,7 @@ import numpy as np
 from dt_viz.flows.fields import Array
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.demonstrations import Demonstration, DemonstrationError, lasa_files, load_demonstrations
-from dt_viz.learning.interface import AnyImitation
+from dt_viz.learning.interface import AnyImitation, State
 from dt_viz.metrics import resample_by_arc_length
 from dt_viz.numerics import unit
 from dt_viz.obstacles.shapes import as_point
@@ -59,6 +59,8 @@ class Task:
     """Pots on the table, from left to right."""
     objects: tuple[TaskObject, ...] = ()
     """What the hand moves."""
+    state: State = "auto"
+    """State that it is learned in where none is asked for."""
     draws: bool = False
     """Whether the hand holds a pen and draws on the slice."""
 
@@ -102,10 +104,16 @@ class TaskEntry:
         return self.load()
 
 
-def letter(character: str, hint: str = "Drag the sphere through the letter.", obstacle_at: float = 0.5) -> Task:
+def letter(
+    character: str,
+    hint: str = "Drag the sphere through the letter.",
+    obstacle_at: float = 0.5,
+    state: State = "plain",
+) -> Task:
     """Draw a letter that ships with DT-Viz, in a vertical plane before the robot (sec. 5); see `drawing_task`."""
     name = f"draw_{character.lower()}"
-    return drawing_task(name, TASKS[name].title, hint, load_demonstrations(ASSETS / f"{name}.npz"), obstacle_at)
+    task = drawing_task(name, TASKS[name].title, hint, load_demonstrations(ASSETS / f"{name}.npz"), obstacle_at)
+    return replace(task, state=state)
 
 
 def lift_box() -> Task:
@@ -119,6 +127,7 @@ def lift_box() -> Task:
     lowest = np.mean([d.positions[d.positions[:, 2].argmin()] for d in demonstrations], axis=0)
     return Task(
         name="lift_box",
+        state="plain",
         title="Lift box",
         hint="Put the sphere in the way into the box, or on the way up.",
         demonstrations=demonstrations,
@@ -138,6 +147,7 @@ def push_box() -> Task:
     mean = _mean(demonstrations)
     return Task(
         name="push_box",
+        state="plain",
         title="Push box",
         hint="Put the sphere where the box is pushed along the table.",
         demonstrations=demonstrations,
@@ -157,6 +167,7 @@ def drop_pots() -> Task:
     down = unit(np.array([0.0, y, z]))
     return Task(
         name="drop_pots",
+        state="plain",
         title="Drop in pots",
         hint="Bias the motion to the left or the right pot, its goal along with it.",
         demonstrations=demonstrations,
@@ -248,8 +259,12 @@ TASKS: Mapping[str, TaskEntry] = {
     "draw_g": TaskEntry("Draw G", partial(letter, "G")),
     "draw_w": TaskEntry("Draw W", partial(letter, "W", obstacle_at=0.36)),  # not between two strokes
     "draw_z": TaskEntry("Draw Z", partial(letter, "Z")),
-    "draw_8": TaskEntry("Draw 8", partial(letter, "8", "The 8 crosses itself. Drag the sphere through it.", 0.3)),
-    "draw_s_wavy": TaskEntry("Draw wavy S", partial(letter, "S_wavy", "The S of another hand, in waves.")),
+    "draw_8": TaskEntry(
+        "Draw 8", partial(letter, "8", "The 8 crosses itself. Drag the sphere through it.", 0.3, "augmented")
+    ),
+    "draw_s_wavy": TaskEntry(
+        "Draw wavy S", partial(letter, "S_wavy", "The S of another hand, in waves.", state="augmented")
+    ),
     "lift_box": TaskEntry("Lift box", lift_box),
     "push_box": TaskEntry("Push box", push_box),
     "drop_pots": TaskEntry("Drop in pots", drop_pots),

@@ -133,8 +133,11 @@ class Engine:
     @kept(by=lambda scenario, _: scenario.learned, of="_shared")
     def _learned(self, scenario: Scenario, progress: Progress | None) -> Learned:
         task = self.task(scenario.task)
-        state = scenario.state if scenario.imitation else "plain"  # without it there is nothing to remember
+        state = task.state if scenario.state == "auto" else scenario.state
+        state = state if scenario.imitation else "plain"  # without it there is nothing to remember
         imitation = self._fits.learned(task.demonstrations, ImitationSettings(scenario.objective), state, progress)
+        if imitation.state == "augmented" and scenario.state == "auto" and not imitation.reason:
+            imitation = replace(imitation, reason="the plain state misses a demonstration of this task")
         return Learned.of(task, imitation, imitates=scenario.imitation)
 
     @kept(NEWEST, by=lambda task: task)

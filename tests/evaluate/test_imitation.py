@@ -1,6 +1,7 @@
 """What was learned of files, beside what was demonstrated, in-sample and held out."""
 
 import json
+import re
 import sys
 
 import numpy as np
@@ -177,16 +178,32 @@ def test_what_is_held_out_is_not_learned_from():
 def test_a_shape_that_cannot_be_fitted_does_not_keep_the_others_from_it(lasa, tmp_path, monkeypatch, capsys):
     from dt_viz.learning.imitation import ImitationError
 
-    def fit_only_in_the_plane(demonstrations, settings):
+    def learn_only_in_the_plane(demonstrations, **settings):
         if demonstrations[0].dimension == 3:
             raise ImitationError("demonstration 'lifted' is too strange")
-        return real(demonstrations, settings)
+        return real(demonstrations, **settings)
 
-    real = imitation.fit
-    monkeypatch.setattr(imitation, "fit", fit_only_in_the_plane)
+    real = imitation.learn_in_state
+    monkeypatch.setattr(imitation, "learn_in_state", learn_only_in_the_plane)
     times, positions = hook(0)
     space = tmp_path / "space.npz"
     save_demonstrations(space, [Demonstration(times, np.column_stack([positions, times]) / 1000, "lifted")])
     assert main(["imitation", str(space), str(lasa / "Hook.mat"), "--out", str(tmp_path / "out")]) == 2
     assert f"{space}: demonstration 'lifted' is too strange" in capsys.readouterr().err
     assert (tmp_path / "out" / "Hook.npz").exists() and not (tmp_path / "out" / "space.npz").exists()
+
+
+def test_what_was_chosen_and_the_trivial_way_are_printed(lasa, tmp_path, capsys):
+    recorded = [hook(i) for i in range(4)]
+    save_demonstrations(
+        tmp_path / "hooks.npz", [Demonstration(t, path / 1000, str(i)) for i, (t, path) in enumerate(recorded)]
+    )
+    run = ["imitation", str(tmp_path / "hooks.npz"), "--state", "auto", "--folds", "2", "--out", str(tmp_path / "out")]
+    assert main(run) == 0
+    printed = capsys.readouterr().out
+    (row,) = json.loads((tmp_path / "out" / "figures.json").read_text())["held_out"]
+    assert row["of_mean"] == pytest.approx(row["learned_mm"] / row["mean_mm"]) and row["plain"] in (0, 0.5, 1)
+    assert re.search(
+        r"hooks: (plain|augmented)\. \d demonstrations left out: plain .* mm .* × the shifted mean", printed
+    )
+    assert f"{row['of_mean']:.3f} at worst" in printed

@@ -57,7 +57,7 @@ def test_a_figure_that_is_drawn_often_gets_the_knots_that_it_needs(num):
 
     assert off() < 0.05
     if num > 1:
-        assert off(max_knots=30) > 0.07
+        assert off(min_knots=30, max_knots=30) > 0.07
 
 
 def test_the_size_of_demonstrations_does_not_depend_on_how_they_are_turned():

@@ -85,9 +85,9 @@ def test_taken_off_again_nothing_is_left_and_ends_stay(style, task):
 
 def test_hands_of_other_detail_give_a_style_too(style):
     usual = learned("draw_s")
-    finer = fit_augmented(TASKS[STYLES["wavy"][1]]().demonstrations, settings=AugmentedSettings(min_knots=60))
+    finer = fit_augmented(TASKS[STYLES["wavy"][1]]().demonstrations, settings=AugmentedSettings(min_knots=240))
     mixed, own = Style.between(usual, finer), learned("draw_c")
-    assert len(mixed.offsets) == 60 and len(style.offsets) == 30
+    assert len(mixed.offsets) == 240 and len(style.offsets) == 120
     for on in (style, mixed):
         path, wanted = (path_from(one.on(own, 1.0), own.starts[0]) for one in (on, style))
         assert np.linalg.norm(path - wanted, axis=1).max() < 0.05 * own.top

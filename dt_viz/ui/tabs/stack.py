@@ -244,7 +244,7 @@ def add_transform_settings(gui: viser.GuiApi, bindings: Bindings, order: float) 
     hint = (
         "plain: the paper's, one field that needs no memory. augmented: remembers its phase and where it began, so "
         "that it crosses itself, comes back, and draws the figure from other starts. auto: plain, unless it "
-        "misses a demonstration"
+        "misses a demonstration, or clearly those that it has not learned from"
     )
     state = gui.add_dropdown("State", STATES, order=order, hint=hint)
     bindings.field(state, "state")
