@@ -79,7 +79,7 @@ class Demonstration:
 
     times: np.ndarray
     positions: np.ndarray
-    name: str
+    name: str = ""
 
     @property
     def dimension(self) -> int:

@@ -1,0 +1,313 @@
+"""Inspection of demonstrations: what is odd about a take, take by take, and what is done about it.
+
+Takes without findings stay as they are, to the last bit. What is measured is scale-free: an outlier is a jump and back,
+far longer than the take's steps; jitter makes a take longer than it is when what is faster than a hand means to move is
+taken out; a pause is a run of hundredths of the duration in which hardly anything moves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+from scipy.linalg import solveh_banded
+
+from dt_viz.flows.fields import Array, Indices
+from dt_viz.learning.demonstrations import Demonstration
+from dt_viz.metrics import arc_length, interpolate
+from dt_viz.warning import in_millimetres
+
+FindingKind = Literal["units", "outliers", "gap", "jitter", "pause", "still", "elsewhere", "end", "start"]
+"""Kind of a finding: another unit, single samples far off, a time without samples, trembling, standing still, never
+moving, an end that is not the others' goal, one beside it, and a start at the goal."""
+
+
+@dataclass(frozen=True)
+class PreparationSettings:
+    """Settings of the preparation. Lengths are in spreads, the RMS distance of all points from their mean."""
+
+    same_goal: float = 1e-3
+    """Distance from the goal up to which an end is at the goal."""
+    max_moved_end: float = 0.3
+    """Distance from the goal up to which an end is moved there; farther ones are left out."""
+    at_goal: float = 0.05
+    """Distance from the goal up to which a start is at the goal."""
+    standing_step: float = 1e-3
+    """Length of a step, lasting 1 % of the motion, below which the motion stands still."""
+    long_stand: float = 0.1
+    """Part of the duration from which standing still is reported."""
+    goal: tuple[float, ...] | None = None
+    """(d,) the goal, metres; None is where most takes end."""
+    convert_units: bool = True
+    """Whether a take in millimetres among others in metres is converted."""
+    drop_outliers: bool = True
+    """Whether single samples far off are left out."""
+    bridge_gaps: bool = True
+    """Whether times without samples are bridged by a curve; otherwise by a straight line."""
+    smooth_jitter: bool = True
+    """Whether jitter is smoothed."""
+    cut_pauses: bool = True
+    """Whether pauses are cut."""
+    move_ends: bool = True
+    """Whether ends beside the goal are moved there; otherwise these takes are left out."""
+    leave_out: bool = True
+    """Whether takes that end elsewhere are left out; otherwise their ends are moved, however far."""
+    outlier: float = 3.0
+    """Least length of the jumps to an outlier and back, relative to a long step (the 90 % quantile) of the take. The
+    longest step of clean takes is 1.7."""
+    jitter: float = 1.05
+    """Least factor by which jitter makes a take longer. Clean takes get shorter by 1.1 % when they are smoothed."""
+    cutoff: float = 5.0
+    """Frequency above which motion is jitter, Hz; tremor begins at 6 Hz."""
+    cycles: float = 20.0
+    """Least cut-off frequency for short takes, in oscillations a take."""
+    gap: float = 0.1
+    """Shortest time without samples that is a gap, seconds, if it is also as long as five usual ones."""
+    widest_gap: float = 0.25
+    """Longest gap that is bridged by a curve, relative to the duration."""
+    noisy_step: float = 0.3
+    """`standing_step` of a take that jitters, relative to the jitter."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One oddity of a take."""
+
+    kind: FindingKind
+    text: str
+    """Predicate of a sentence about the take, such as "stands still for 1.2 s"."""
+    remedy: str = ""
+    """What is done about it, such as "the pause is cut"; empty where nothing is."""
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What was found out about one take."""
+
+    name: str
+    duration: float
+    """Seconds."""
+    num_samples: int
+    kept: bool
+    """Whether it is learned from."""
+    findings: tuple[Finding, ...] = ()
+
+    @property
+    def rate(self) -> float:
+        """Mean number of samples a second, Hz."""
+        return (self.num_samples - 1) / self.duration
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """A sentence for each finding, with the take's name."""
+        return tuple(
+            f"'{self.name}' {found.text}{'; ' if found.remedy else ''}{found.remedy}" for found in self.findings
+        )
+
+    def __str__(self) -> str:
+        rate = f"{self.rate:.3g} Hz"
+        found = "; ".join(f"{each.text} ({each.remedy or 'nothing is done'})" for each in self.findings)
+        return f"'{self.name}': {self.duration:.3g} s, {self.num_samples} samples, {rate}: {found or 'as it should be'}"
+
+
+@dataclass
+class Take:
+    """A take on its way through the inspection; `times` and `positions` are what has been made of it."""
+
+    demonstration: Demonstration
+    times: Array
+    positions: Array
+    findings: list[Finding] = field(default_factory=list)
+    kept: bool = True
+    jitter: float = 0.0
+    """RMS of what was smoothed, metres."""
+
+    def __post_init__(self) -> None:
+        self._given = self.times, self.positions
+
+    def find(self, kind: FindingKind, text: str, remedy: str = "") -> None:
+        """Note a finding."""
+        self.findings.append(Finding(kind, text, remedy))
+
+    def leave_out(self, kind: FindingKind, text: str) -> None:
+        """Note why it is left out."""
+        self.find(kind, text, "it is left out")
+        self.kept = False
+
+    @property
+    def repaired(self) -> Demonstration:
+        """The demonstration as it is now; the same one where nothing was changed."""
+        if self.times is self._given[0] and self.positions is self._given[1]:
+            return self.demonstration
+        return replace(self.demonstration, times=self.times, positions=self.positions)
+
+    @property
+    def inspection(self) -> Inspection:
+        """What was found out."""
+        own = self.demonstration
+        times = np.asarray(own.times, float)
+        return Inspection(own.name, float(times[-1] - times[0]), len(times), self.kept, tuple(self.findings))
+
+
+def repair(takes: Sequence[Take], settings: PreparationSettings) -> None:
+    """Look for other units, outliers, gaps, jitter and pauses, in this order, and repair them."""
+    _find_units(takes, settings)
+    for take in takes:
+        _find_outliers(take, settings)
+        _smooth(take, settings)
+    _find_pauses(takes, settings)
+
+
+def _find_units(takes: Sequence[Take], settings: PreparationSettings) -> None:
+    """Look for takes in millimetres among takes in metres."""
+    sizes = np.array([np.ptp(take.positions, axis=0).max() for take in takes])
+    others = np.median(sizes)
+    for take, size in zip(takes, sizes, strict=True):
+        if others > 0 and 300 < size / others < 3000:
+            text = f"spans {size:.3g} m, the others {others:.3g} m: it is in millimetres, as it seems"
+            take.find("units", text, "it is converted to metres" if settings.convert_units else "")
+            take.positions = take.positions / 1e3 if settings.convert_units else take.positions
+        elif size > 10:
+            take.find("units", f"spans {size:.3g} m; if it is in millimetres, divide positions by 1,000")
+
+
+def _find_outliers(take: Take, settings: PreparationSettings) -> None:
+    steps = np.linalg.norm(np.diff(take.positions, axis=0), axis=1)
+    if len(steps) < 4 or not steps.any():
+        return
+    usual = np.quantile(steps[steps > 1e-6 * steps.max()], 0.9)
+    size = 2 * np.median(np.linalg.norm(take.positions - np.median(take.positions, axis=0), axis=1))
+    least = max(settings.outlier * usual, 0.03 * size)
+    off = np.zeros(len(take.positions), bool)
+    for num in (1, 2, 3):  # successive outliers
+        jump = np.minimum(steps[:-num], steps[num:])
+        across = np.linalg.norm(take.positions[num + 1 :] - take.positions[: -num - 1], axis=1)
+        for first in np.flatnonzero((jump > least) & (across < jump / 2)):
+            off[first + 1 : first + 1 + num] = True
+    off[0] |= steps[0] > least > 2 * steps[1]
+    off[-1] |= steps[-1] > least > 2 * steps[-2]
+    if off.any() and (~off).sum() >= 2:
+        some = f"a sample up to {in_millimetres(steps.max())} off" if off.sum() == 1 else f"{off.sum()} samples far off"
+        take.find("outliers", f"has {some}", "left out" if settings.drop_outliers else "")
+        if settings.drop_outliers:
+            take.times, take.positions = take.times[~off], take.positions[~off]
+            take.times = take.times - take.times[0]
+
+
+def _smooth(take: Take, settings: PreparationSettings) -> None:
+    """Bridge gaps and smooth jitter, as far as there are any."""
+    times, intervals = take.times, np.diff(take.times)
+    duration, usual = times[-1], float(np.median(intervals))
+    gaps = np.flatnonzero(intervals > max(settings.gap, 5 * usual))
+    bridged = intervals[gaps] <= settings.widest_gap * duration
+    for longest in intervals[gaps].max(initial=0.0, keepdims=True)[: len(gaps)]:
+        several = f", {len(gaps)} gaps" if len(gaps) > 1 else ""
+        remedy = "bridged by a straight line"
+        if settings.bridge_gaps and bridged.any():
+            remedy = "bridged by a curve" if bridged.all() else "the long one is bridged by a straight line"
+        take.find("gap", f"has no samples for {longest:.2g} s{several}", remedy)
+    bends = bool(settings.bridge_gaps and bridged.any())
+    rate = 1 / usual
+    cutoff = max(settings.cutoff, settings.cycles / duration)
+    jitters = False
+    grid = _Grid(take, gaps[~bridged] if settings.bridge_gaps else gaps)
+    if rate >= 4 * cutoff:  # below, jitter cannot be told from motion
+        smooth = grid.smoothed(cutoff)
+        off = grid.off(smooth)
+        jitters = arc_length(take.positions)[-1] > settings.jitter * max(arc_length(smooth)[-1], 1e-300)
+    if jitters:
+        take.jitter = off
+        remedy = "smoothed" if settings.smooth_jitter else ""
+        take.find("jitter", f"jitters by {in_millimetres(off)}", remedy)
+    if jitters and settings.smooth_jitter:
+        while grid.off(smoother := grid.smoothed(cutoff / 1.5)) < 1.05 * off and cutoff * duration > 2:
+            cutoff, smooth = cutoff / 1.5, smoother
+        take.times, take.positions = grid.nodes, smooth
+    elif bends:
+        curve = grid.smoothed(rate)
+        inside = np.any([(grid.nodes > times[k]) & (grid.nodes < times[k + 1]) for k in gaps[bridged]], axis=0)
+        order = np.argsort(np.concatenate([times, grid.nodes[inside]]), kind="stable")
+        take.times = np.concatenate([times, grid.nodes[inside]])[order]
+        take.positions = np.concatenate([take.positions, curve[inside]])[order]
+
+
+class _Grid:
+    """Even times over a take, at most 2,000, and positions there with a small second difference.
+
+    f = argmin Σ_i ‖x_i − f(node of t_i)‖² + λ Σ ‖second difference of f‖². It passes frequencies far below the cut-off
+    1/(2π) (c/λ)^¼ / h, for c samples at each node and a distance h of the nodes; where no samples are, it is a cubic.
+    """
+
+    def __init__(self, take: Take, straight: Indices) -> None:
+        """Take a take, and the indices of the gaps that are bridged by a straight line."""
+        times, x = take.times, take.positions
+        spacing = max(float(np.median(np.diff(times))), times[-1] / 2000)
+        self.nodes = np.linspace(0.0, times[-1], int(np.rint(times[-1] / spacing)) + 1)
+        for k in straight:
+            between = self.nodes[(self.nodes > times[k] + spacing / 2) & (self.nodes < times[k + 1] - spacing / 2)]
+            x = np.concatenate([x, interpolate(between, times, take.positions)])
+            times = np.concatenate([times, between])
+        self._times, self._x, self._mean = times, x, x.mean(axis=0)
+        at = np.rint(times / times.max() * (len(self.nodes) - 1)).astype(int)
+        self._counts = np.bincount(at, minlength=len(self.nodes)).astype(float)
+        centred = (x - self._mean).T
+        self._sums = np.stack([np.bincount(at, row, minlength=len(self.nodes)) for row in centred], axis=1)
+
+    def smoothed(self, cutoff: float) -> Array:
+        """Positions at the nodes with a cut-off frequency, Hz."""
+        num = len(self.nodes)
+        if num < 5:
+            return interpolate(self.nodes, self._times, self._x)
+        density = np.median(self._counts[self._counts > 0])
+        weight = density / (2 * np.pi * cutoff * (self.nodes[1] - self.nodes[0])) ** 4
+        band = np.array([[1.0], [-4.0], [6.0]]) * np.ones(num)
+        band[2, [0, -1]], band[2, [1, -2]], band[1, [1, -1]] = 1.0, 5.0, -2.0
+        band *= weight
+        band[2] += self._counts
+        return solveh_banded(band, self._sums) + self._mean
+
+    def off(self, positions: Array) -> float:
+        """RMS distance of the samples from positions at the nodes, metres."""
+        away = self._x - interpolate(self._times, self.nodes, positions)
+        return float(np.sqrt((away**2).sum(axis=1).mean()))
+
+
+def _find_pauses(takes: Sequence[Take], settings: PreparationSettings) -> None:
+    """Look for pauses, and cut them. Those on the way stay where most takes have some: they belong to the motion."""
+    found = [_pauses(take, settings) for take in takes]
+    usual = 2 * sum(any(first > 0 and last < 1 for first, last in pauses) for pauses in found) > len(takes)
+    for take, pauses in zip(takes, found, strict=True):
+        cut = [(first, last) for first, last in pauses if not (usual and first > 0 and last < 1)]
+        rest = sum(last - first for first, last in pauses) * take.times[-1]
+        if not cut or not settings.cut_pauses:
+            remedy = "as most takes do: the pause is kept" if usual else "the learned motion only slows down there"
+        else:
+            remedy = "the pause is cut"
+            _cut(take, np.array(cut) * take.times[-1])
+        if pauses:
+            take.find("pause", f"stands still for {rest:.2g} s", remedy)
+
+
+def _pauses(take: Take, settings: PreparationSettings) -> list[tuple[float, float]]:
+    """Find where a take stands still for long: first and last parts of the duration, none where that is short."""
+    even = np.linspace(0.0, 1.0, 101)
+    steps = np.linalg.norm(np.diff(interpolate(even * take.times[-1], take.times, take.positions), axis=0), axis=1)
+    spread = float(np.sqrt(take.positions.var(axis=0).sum()))
+    slow = steps < max(settings.standing_step * spread, settings.noisy_step * take.jitter)
+    if slow[1:-1].mean() <= settings.long_stand or slow.all():
+        return []
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], slow, [False]]).astype(int)))
+    return [(even[first], even[last]) for first, last in edges.reshape(-1, 2) if last - first > 2]
+
+
+def _cut(take: Take, pauses: Array) -> None:
+    """Cut pauses (N, 2), their first and last moments, seconds; one interval remains of each."""
+    times, keep, earlier = take.times, np.ones(len(take.times), bool), np.zeros(len(take.times))
+    interval = np.median(np.diff(times))
+    for first, last in pauses:
+        keep &= (times <= first) | (times >= last)
+        earlier += (times >= last) * max(last - first - interval, 0.0)
+    times = (times - earlier)[keep]
+    take.times, take.positions = times - times[0], take.positions[keep]
