@@ -55,8 +55,8 @@ class PreparationSettings:
     leave_out: bool = True
     """Whether takes that end elsewhere are left out; otherwise their ends are moved, however far."""
     outlier: float = 3.0
-    """Least length of the jumps to an outlier and back, relative to a long step (the 90 % quantile) of the take. The
-    longest step of clean takes is 1.7."""
+    """Least length of the jumps to an outlier and back, relative to a long step (the 75 % quantile) of the take. The
+    longest step of clean takes is 2.2, at any rate."""
     jitter: float = 1.05
     """Least factor by which jitter makes a take longer. Clean takes get shorter by 1.1 % when they are smoothed."""
     cutoff: float = 5.0
@@ -64,11 +64,11 @@ class PreparationSettings:
     cycles: float = 20.0
     """Least cut-off frequency for short takes, in oscillations a take."""
     gap: float = 0.1
-    """Shortest time without samples that is a gap, seconds, if it is also as long as five usual ones."""
+    """Shortest time without samples that is a gap, seconds, if it is also longer than 2.5 usual intervals."""
     widest_gap: float = 0.25
     """Longest gap that is bridged by a curve, relative to the duration."""
-    noisy_step: float = 0.3
-    """`standing_step` of a take that jitters, relative to the jitter."""
+    noisy_step: float = 0.15
+    """`standing_step` of a take that jitters, relative to the jitter, in the mean of five steps."""
 
 
 @dataclass(frozen=True)
@@ -177,14 +177,14 @@ def _find_outliers(take: Take, settings: PreparationSettings) -> None:
     steps = np.linalg.norm(np.diff(take.positions, axis=0), axis=1)
     if len(steps) < 4 or not steps.any():
         return
-    usual = np.quantile(steps[steps > 1e-6 * steps.max()], 0.9)
+    usual = np.quantile(steps[steps > 1e-6 * steps.max()], 0.75)
     size = 2 * np.median(np.linalg.norm(take.positions - np.median(take.positions, axis=0), axis=1))
     least = max(settings.outlier * usual, 0.03 * size)
     off = np.zeros(len(take.positions), bool)
     for num in (1, 2, 3):  # successive outliers
         jump = np.minimum(steps[:-num], steps[num:])
         across = np.linalg.norm(take.positions[num + 1 :] - take.positions[: -num - 1], axis=1)
-        for first in np.flatnonzero((jump > least) & (across < jump / 2)):
+        for first in np.flatnonzero((jump > least) & (across < 0.8 * jump)):
             off[first + 1 : first + 1 + num] = True
     off[0] |= steps[0] > least > 2 * steps[1]
     off[-1] |= steps[-1] > least > 2 * steps[-2]
@@ -199,8 +199,10 @@ def _find_outliers(take: Take, settings: PreparationSettings) -> None:
 def _smooth(take: Take, settings: PreparationSettings) -> None:
     """Bridge gaps and smooth jitter, as far as there are any."""
     times, intervals = take.times, np.diff(take.times)
+    if len(times) < 8:
+        return
     duration, usual = times[-1], float(np.median(intervals))
-    gaps = np.flatnonzero(intervals > max(settings.gap, 5 * usual))
+    gaps = np.flatnonzero(intervals > max(settings.gap, 2.5 * usual))
     bridged = intervals[gaps] <= settings.widest_gap * duration
     for longest in intervals[gaps].max(initial=0.0, keepdims=True)[: len(gaps)]:
         several = f", {len(gaps)} gaps" if len(gaps) > 1 else ""
@@ -214,19 +216,21 @@ def _smooth(take: Take, settings: PreparationSettings) -> None:
     jitters = False
     grid = _Grid(take, gaps[~bridged] if settings.bridge_gaps else gaps)
     if rate >= 4 * cutoff:  # below, jitter cannot be told from motion
-        smooth = grid.smoothed(cutoff)
-        off = grid.off(smooth)
+        smooth, off = grid.smoothed(cutoff)
         jitters = arc_length(take.positions)[-1] > settings.jitter * max(arc_length(smooth)[-1], 1e-300)
     if jitters:
         take.jitter = off
         remedy = "smoothed" if settings.smooth_jitter else ""
         take.find("jitter", f"jitters by {in_millimetres(off)}", remedy)
     if jitters and settings.smooth_jitter:
-        while grid.off(smoother := grid.smoothed(cutoff / 1.5)) < 1.05 * off and cutoff * duration > 2:
-            cutoff, smooth = cutoff / 1.5, smoother
+        while cutoff * duration > 2:  # lower the cut-off while what remains of the samples is still noise
+            smoother, more = grid.smoothed(cutoff / 1.5)
+            if more > 1.05 * off:
+                break
+            cutoff, smooth, off = cutoff / 1.5, smoother, max(off, more)
         take.times, take.positions = grid.nodes, smooth
     elif bends:
-        curve = grid.smoothed(rate)
+        curve, _ = grid.smoothed(rate)
         inside = np.any([(grid.nodes > times[k]) & (grid.nodes < times[k + 1]) for k in gaps[bridged]], axis=0)
         order = np.argsort(np.concatenate([times, grid.nodes[inside]]), kind="stable")
         take.times = np.concatenate([times, grid.nodes[inside]])[order]
@@ -255,23 +259,23 @@ class _Grid:
         centred = (x - self._mean).T
         self._sums = np.stack([np.bincount(at, row, minlength=len(self.nodes)) for row in centred], axis=1)
 
-    def smoothed(self, cutoff: float) -> Array:
-        """Positions at the nodes with a cut-off frequency, Hz."""
+    def smoothed(self, cutoff: float) -> tuple[Array, float]:
+        """Positions at the nodes with a cut-off frequency, Hz, and the RMS noise of the samples, metres.
+
+        The curve follows a part of white noise, too, by its response 1/(1 + λ/c (2 sin(ω/2))⁴).
+        """
         num = len(self.nodes)
-        if num < 5:
-            return interpolate(self.nodes, self._times, self._x)
         density = np.median(self._counts[self._counts > 0])
-        weight = density / (2 * np.pi * cutoff * (self.nodes[1] - self.nodes[0])) ** 4
         band = np.array([[1.0], [-4.0], [6.0]]) * np.ones(num)
         band[2, [0, -1]], band[2, [1, -2]], band[1, [1, -1]] = 1.0, 5.0, -2.0
-        band *= weight
+        relative = (2 * np.pi * cutoff * (self.nodes[1] - self.nodes[0])) ** -4
+        band *= relative * density
         band[2] += self._counts
-        return solveh_banded(band, self._sums) + self._mean
-
-    def off(self, positions: Array) -> float:
-        """RMS distance of the samples from positions at the nodes, metres."""
-        away = self._x - interpolate(self._times, self.nodes, positions)
-        return float(np.sqrt((away**2).sum(axis=1).mean()))
+        found = solveh_banded(band, self._sums) + self._mean
+        away = self._x - interpolate(self._times, self.nodes, found)
+        response = 1 / (1 + relative * (2 * np.sin(np.linspace(0, np.pi / 2, 100))) ** 4)
+        missed = 1 - (2 * response - response**2).mean() / density
+        return found, float(np.sqrt((away**2).sum(axis=1).mean() / missed))
 
 
 def _find_pauses(takes: Sequence[Take], settings: PreparationSettings) -> None:
@@ -293,9 +297,12 @@ def _find_pauses(takes: Sequence[Take], settings: PreparationSettings) -> None:
 def _pauses(take: Take, settings: PreparationSettings) -> list[tuple[float, float]]:
     """Find where a take stands still for long: first and last parts of the duration, none where that is short."""
     even = np.linspace(0.0, 1.0, 101)
-    steps = np.linalg.norm(np.diff(interpolate(even * take.times[-1], take.times, take.positions), axis=0), axis=1)
+    places = interpolate(even * take.times[-1], take.times, take.positions)
+    width = 5 if take.jitter else 1
+    steps = np.linalg.norm(places[width:] - places[:-width], axis=1) / width
     spread = float(np.sqrt(take.positions.var(axis=0).sum()))
-    slow = steps < max(settings.standing_step * spread, settings.noisy_step * take.jitter)
+    standing = steps < max(settings.standing_step * spread, settings.noisy_step * take.jitter)
+    slow = np.convolve(standing, np.ones(width)) > 0
     if slow[1:-1].mean() <= settings.long_stand or slow.all():
         return []
     edges = np.flatnonzero(np.diff(np.concatenate([[False], slow, [False]]).astype(int)))
