@@ -91,6 +91,10 @@ class Demonstration:
         """Time from the first to the last sample, seconds."""
         return float(self.times[-1])
 
+    def __repr__(self) -> str:
+        num, coordinates = np.shape(self.positions)[0], np.shape(self.positions)[-1]
+        return f"Demonstration({self.name!r}: {num} samples of {coordinates} coordinates, {self.times[-1]:.3g} s)"
+
 
 class DemonstrationError(DataError):
     """A demonstration that cannot be used."""

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from scipy.linalg import solveh_banded
+from scipy.spatial.transform import Rotation, Slerp
 
-from dt_viz.flows.fields import Array, Indices
+from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.metrics import arc_length, interpolate
 from dt_viz.warning import in_millimetres
@@ -126,6 +127,12 @@ class Take:
 
     def __post_init__(self) -> None:
         self._given = self.times, self.positions
+        self._moments = self.times  # those of the demonstration at which the samples are now
+
+    def replace(self, times: Array, positions: Array, moments: Array) -> None:
+        """Take other samples; `moments` are their times before, the first of `times` is to be 0 afterwards."""
+        self._moments = np.interp(moments, self.times, self._moments)
+        self.times, self.positions = times - times[0], positions
 
     def find(self, kind: FindingKind, text: str, remedy: str = "") -> None:
         """Note a finding."""
@@ -141,7 +148,13 @@ class Take:
         """The demonstration as it is now; the same one where nothing was changed."""
         if self.times is self._given[0] and self.positions is self._given[1]:
             return self.demonstration
-        return replace(self.demonstration, times=self.times, positions=self.positions)
+        changes: dict[str, Any] = {"times": self.times, "positions": self.positions}
+        turns = getattr(self.demonstration, "orientations", None)
+        if turns is not None:
+            at = np.interp(self._moments, self._given[0], np.arange(len(turns)))
+            turning = Slerp(np.arange(len(turns)), Rotation.from_quat(np.roll(turns, -1, axis=1)))
+            changes["orientations"] = np.roll(turning(at).as_quat(), 1, axis=1)  # wxyz
+        return replace(self.demonstration, **changes)
 
     @property
     def inspection(self) -> Inspection:
@@ -192,49 +205,56 @@ def _find_outliers(take: Take, settings: PreparationSettings) -> None:
         some = f"a sample up to {in_millimetres(steps.max())} off" if off.sum() == 1 else f"{off.sum()} samples far off"
         take.find("outliers", f"has {some}", "left out" if settings.drop_outliers else "")
         if settings.drop_outliers:
-            take.times, take.positions = take.times[~off], take.positions[~off]
-            take.times = take.times - take.times[0]
+            take.replace(take.times[~off], take.positions[~off], take.times[~off])
 
 
 def _smooth(take: Take, settings: PreparationSettings) -> None:
     """Bridge gaps and smooth jitter, as far as there are any."""
-    times, intervals = take.times, np.diff(take.times)
-    if len(times) < 8:
+    if len(take.times) < 8:
         return
-    duration, usual = times[-1], float(np.median(intervals))
-    gaps = np.flatnonzero(intervals > max(settings.gap, 2.5 * usual))
-    bridged = intervals[gaps] <= settings.widest_gap * duration
-    for longest in intervals[gaps].max(initial=0.0, keepdims=True)[: len(gaps)]:
+    gaps, curved = _gaps(take, settings)
+    grid = _Grid(take, gaps[~curved])
+    smooth = _without_jitter(take, grid, settings)
+    if smooth is not None:
+        take.replace(grid.nodes, smooth, grid.nodes)
+    elif curved.any():
+        times, (curve, _) = take.times, grid.smoothed(1 / np.median(np.diff(take.times)))
+        inside = np.any([(grid.nodes > times[k]) & (grid.nodes < times[k + 1]) for k in gaps[curved]], axis=0)
+        moments = np.concatenate([times, grid.nodes[inside]])
+        order = np.argsort(moments, kind="stable")
+        take.replace(moments[order], np.concatenate([take.positions, curve[inside]])[order], moments[order])
+
+
+def _gaps(take: Take, settings: PreparationSettings) -> tuple[Indices, Mask]:
+    """Find gaps (G,), the samples before them, and which of them (G,) a curve is to bridge."""
+    intervals = np.diff(take.times)
+    gaps = np.flatnonzero(intervals > max(settings.gap, 2.5 * np.median(intervals)))
+    curved = (intervals[gaps] <= settings.widest_gap * take.times[-1]) & settings.bridge_gaps
+    if len(gaps):
         several = f", {len(gaps)} gaps" if len(gaps) > 1 else ""
-        remedy = "bridged by a straight line"
-        if settings.bridge_gaps and bridged.any():
-            remedy = "bridged by a curve" if bridged.all() else "the long one is bridged by a straight line"
-        take.find("gap", f"has no samples for {longest:.2g} s{several}", remedy)
-    bends = bool(settings.bridge_gaps and bridged.any())
-    rate = 1 / usual
+        how = "a curve" if curved.all() else "a straight line" if not curved.any() else "curves and straight lines"
+        take.find("gap", f"has no samples for {intervals[gaps].max():.2g} s{several}", f"bridged by {how}")
+    return gaps, curved
+
+
+def _without_jitter(take: Take, grid: _Grid, settings: PreparationSettings) -> Array | None:
+    """Positions at the nodes of a take that jitters, smoothed as far as what is taken out is noise."""
+    duration = take.times[-1]
     cutoff = max(settings.cutoff, settings.cycles / duration)
-    jitters = False
-    grid = _Grid(take, gaps[~bridged] if settings.bridge_gaps else gaps)
-    if rate >= 4 * cutoff:  # below, jitter cannot be told from motion
-        smooth, off = grid.smoothed(cutoff)
-        jitters = arc_length(take.positions)[-1] > settings.jitter * max(arc_length(smooth)[-1], 1e-300)
-    if jitters:
-        take.jitter = off
-        remedy = "smoothed" if settings.smooth_jitter else ""
-        take.find("jitter", f"jitters by {in_millimetres(off)}", remedy)
-    if jitters and settings.smooth_jitter:
-        while cutoff * duration > 2:  # lower the cut-off while what remains of the samples is still noise
-            smoother, more = grid.smoothed(cutoff / 1.5)
-            if more > 1.05 * off:
-                break
-            cutoff, smooth, off = cutoff / 1.5, smoother, max(off, more)
-        take.times, take.positions = grid.nodes, smooth
-    elif bends:
-        curve, _ = grid.smoothed(rate)
-        inside = np.any([(grid.nodes > times[k]) & (grid.nodes < times[k + 1]) for k in gaps[bridged]], axis=0)
-        order = np.argsort(np.concatenate([times, grid.nodes[inside]]), kind="stable")
-        take.times = np.concatenate([times, grid.nodes[inside]])[order]
-        take.positions = np.concatenate([take.positions, curve[inside]])[order]
+    if 4 * cutoff * np.median(np.diff(take.times)) > 1:  # at a lower rate, jitter cannot be told from motion
+        return None
+    smooth, noise = grid.smoothed(cutoff)
+    if arc_length(take.positions)[-1] <= settings.jitter * arc_length(smooth)[-1]:
+        return None
+    take.jitter = noise
+    take.find("jitter", f"jitters by {in_millimetres(take.jitter)}", "smoothed" if settings.smooth_jitter else "")
+    while cutoff * duration > 2:
+        cutoff /= 1.5
+        smoother, more = grid.smoothed(cutoff)
+        if more > 1.05 * noise:
+            break
+        smooth, noise = smoother, max(noise, more)
+    return smooth if settings.smooth_jitter else None
 
 
 class _Grid:
@@ -316,5 +336,4 @@ def _cut(take: Take, pauses: Array) -> None:
     for first, last in pauses:
         keep &= (times <= first) | (times >= last)
         earlier += (times >= last) * max(last - first - interval, 0.0)
-    times = (times - earlier)[keep]
-    take.times, take.positions = times - times[0], take.positions[keep]
+    take.replace((times - earlier)[keep], take.positions[keep], times[keep])

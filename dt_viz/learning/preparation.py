@@ -23,6 +23,10 @@ class ImitationError(ValueError):
     """Demonstrations from which no stable system can be learned; the message names the demonstration and the reason."""
 
 
+class DemonstrationWarning(UserWarning):
+    """Something odd about demonstrations, and what was done about it."""
+
+
 @dataclass(frozen=True)
 class Motions:
     """Prepared motions, the input of a fit."""

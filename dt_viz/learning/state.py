@@ -20,7 +20,7 @@ from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.imitation import Imitation, ImitationSettings, Progress, fit
 from dt_viz.learning.interface import STATES, AnyImitation, State
 from dt_viz.learning.patterns import AugmentedSettings
-from dt_viz.learning.preparation import ImitationError, prepare
+from dt_viz.learning.preparation import ImitationError, PreparationSettings, prepare
 
 
 def learn(
@@ -56,23 +56,29 @@ def learn(
         return plain(settings)
     reason = ""
     if state == "auto" and labels is None:
-        reason = why_augmented(demonstrations, plain)
+        reason = why_augmented(demonstrations, plain, settings.preparation)
         if not reason:
             return plain(settings)
     return fit_augmented(demonstrations, labels, augmented, reason)
 
 
-def why_augmented(demonstrations: Sequence[Demonstration], plain: Callable[[ImitationSettings], Imitation]) -> str:
+def why_augmented(
+    demonstrations: Sequence[Demonstration],
+    plain: Callable[[ImitationSettings], Imitation],
+    preparation: PreparationSettings | None = None,
+) -> str:
     """Why demonstrations are to be learned in the augmented state; empty where the plain one draws them.
 
     Args:
         demonstrations: as of `learn`.
         plain: gives the plain fit with these settings.
+        preparation: settings of the preparation; None takes the defaults.
 
     Raises:
         ImitationError: nothing can be learned from the demonstrations, in whichever state.
     """
-    motions, settings = prepare(demonstrations), ImitationSettings()
+    settings = ImitationSettings(preparation=preparation or PreparationSettings())
+    motions = prepare(demonstrations, settings.preparation)
     try:
         off = motions.missed_by(plain(settings).system, motions.starts)
     except ImitationError as error:
