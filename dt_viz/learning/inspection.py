@@ -249,11 +249,11 @@ def _without_jitter(take: Take, grid: _Grid, settings: PreparationSettings) -> A
     take.jitter = noise
     take.find("jitter", f"jitters by {in_millimetres(take.jitter)}", "smoothed" if settings.smooth_jitter else "")
     while cutoff * duration > 2:
-        cutoff /= 1.5
-        smoother, more = grid.smoothed(cutoff)
-        if more > 1.05 * noise:
+        smoother, more = grid.smoothed(cutoff / 1.5)
+        left = 2.22 * cutoff * duration / len(take.times)  # part of the variance that passes, ∫ 1/(1 + (f/cutoff)⁴)
+        if (more / noise) ** 2 > 1 + min(left, 0.1):  # more motion would be taken out than noise is left
             break
-        smooth, noise = smoother, max(noise, more)
+        smooth, cutoff, noise = smoother, cutoff / 1.5, max(noise, more)
     return smooth if settings.smooth_jitter else None
 
 
@@ -299,25 +299,26 @@ class _Grid:
 
 
 def _find_pauses(takes: Sequence[Take], settings: PreparationSettings) -> None:
-    """Look for pauses, and cut them. Those on the way stay where most takes have some: they belong to the motion."""
+    """Look for pauses, and cut them. On the way they stay where most takes have one: these belong to the motion."""
     found = [_pauses(take, settings) for take in takes]
-    usual = 2 * sum(any(first > 0 and last < 1 for first, last in pauses) for pauses in found) > len(takes)
     for take, pauses in zip(takes, found, strict=True):
-        cut = [(first, last) for first, last in pauses if not (usual and first > 0 and last < 1)]
-        rest = sum(last - first for first, last in pauses) * take.times[-1]
-        if not cut or not settings.cut_pauses:
-            remedy = "as most takes do: the pause is kept" if usual else "the learned motion only slows down there"
-        else:
-            remedy = "the pause is cut"
-            _cut(take, np.array(cut) * take.times[-1])
+        usual = [
+            0 < place < 1 and 2 * sum(any(abs(other[2] - place) < 0.1 for other in each) for each in found) > len(takes)
+            for _, _, place in pauses
+        ]
+        cut = [pause[:2] for pause, kept in zip(pauses, usual, strict=True) if not kept and settings.cut_pauses]
         if pauses:
-            take.find("pause", f"stands still for {rest:.2g} s", remedy)
+            remedy = "as most takes do: the pause is kept" if any(usual) else "the learned motion only slows down there"
+            text = f"stands still for {sum(last - first for first, last, _ in pauses):.2g} s"
+            take.find("pause", text, "the pause is cut" if cut else remedy)
+        if cut:
+            _cut(take, np.array(cut))
 
 
-def _pauses(take: Take, settings: PreparationSettings) -> list[tuple[float, float]]:
-    """Find where a take stands still for long: first and last parts of the duration, none where that is short."""
-    even = np.linspace(0.0, 1.0, 101)
-    places = interpolate(even * take.times[-1], take.times, take.positions)
+def _pauses(take: Take, settings: PreparationSettings) -> list[tuple[float, float, float]]:
+    """Find where a take stands still for long: first and last moments, seconds, and the part of the way behind."""
+    even = np.linspace(0.0, take.times[-1], 101)
+    places = interpolate(even, take.times, take.positions)
     width = 5 if take.jitter else 1
     steps = np.linalg.norm(places[width:] - places[:-width], axis=1) / width
     spread = float(np.sqrt(take.positions.var(axis=0).sum()))
@@ -325,15 +326,21 @@ def _pauses(take: Take, settings: PreparationSettings) -> list[tuple[float, floa
     slow = np.convolve(standing, np.ones(width)) > 0
     if slow[1:-1].mean() <= settings.long_stand or slow.all():
         return []
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], slow, [False]]).astype(int)))
-    return [(even[first], even[last]) for first, last in edges.reshape(-1, 2) if last - first > 2]
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], slow, [False]]).astype(int))).reshape(-1, 2)
+    way = arc_length(places) / arc_length(places)[-1]
+    return [
+        (even[first], even[last], 0.0 if first == 0 else 1.0 if last == 100 else way[first])
+        for first, last in edges
+        if last - first > 2
+    ]
 
 
 def _cut(take: Take, pauses: Array) -> None:
     """Cut pauses (N, 2), their first and last moments, seconds; one interval remains of each."""
     times, keep, earlier = take.times, np.ones(len(take.times), bool), np.zeros(len(take.times))
-    interval = np.median(np.diff(times))
+    interval = float(np.median(np.diff(times)))
     for first, last in pauses:
-        keep &= (times <= first) | (times >= last)
-        earlier += (times >= last) * max(last - first - interval, 0.0)
+        before, after = np.searchsorted(times, first, "right") - 1, np.searchsorted(times, last)
+        keep[before + 1 : after] = False
+        earlier[after:] += max(times[after] - times[before] - interval, 0.0)
     take.replace((times - earlier)[keep], take.positions[keep], times[keep])

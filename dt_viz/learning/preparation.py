@@ -45,7 +45,7 @@ class Motions:
     inspections: tuple[Inspection, ...]
     """What was found out about each demonstration, also about those that are left out."""
     repaired: tuple[Demonstration, ...]
-    """All demonstrations without outliers, gaps, jitter and pauses; their ends are where they were."""
+    """All demonstrations without outliers, gaps, jitter and pauses; their ends are where they were, but for jitter."""
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -123,9 +123,9 @@ def prepare(demonstrations: Sequence[Demonstration], settings: PreparationSettin
     if not moving:
         raise ImitationError("no demonstration moves; at least one must lead to the goal")
     repair(moving, settings)
-    repaired = tuple(take.repaired for take in takes)
     spread = _spread(moving)
     goal = _common_goal(moving, spread, settings)
+    repaired = tuple(take.repaired for take in takes)
     for take in moving:
         if take.kept:
             _lead_to_goal(take, goal, settings.at_goal * spread)
@@ -157,14 +157,20 @@ def _common_goal(takes: Sequence[Take], spread: float, settings: PreparationSett
         if 2 * near.sum() <= len(ends):
             raise ImitationError(_no_common_goal(takes, ends, reach))
         goal = ends[near].mean(axis=0)
+        if not settings.move_ends:
+            goal = ends[np.linalg.norm(ends - goal, axis=1).argmin()]
     for take, end in zip(takes, ends, strict=True):
         off = float(np.linalg.norm(end - goal))
         text = f"ends {in_millimetres(off)} from the {'goal' if settings.goal else 'common goal'}"
         if off > reach and settings.leave_out:
             take.leave_out("elsewhere", text)
-        elif off > settings.same_goal * spread and not settings.move_ends:
+        elif 0 < off <= take.jitter:
+            take.positions = _end_moved(take.positions, goal)
+        elif off <= settings.same_goal * spread:
+            continue
+        elif not settings.move_ends:
             take.leave_out("end", text)
-        elif off > settings.same_goal * spread:
+        else:
             take.find("end", text, "its end is moved there")
     if not any(take.kept for take in takes):
         raise ImitationError("no demonstration ends at the goal; accepted: move_ends=True, which moves ends there")

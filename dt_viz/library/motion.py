@@ -30,7 +30,7 @@ from dt_viz.learning.inspection import Inspection
 from dt_viz.learning.patterns import AugmentedSettings
 from dt_viz.learning.preparation import DemonstrationWarning, prepare
 from dt_viz.learning.state import State, learn
-from dt_viz.library.places import in_space
+from dt_viz.library.places import as_place, in_space
 from dt_viz.library.report import many, missed, placed, sampled, summaries
 from dt_viz.library.takes import Demonstrations, demonstrations_of
 from dt_viz.motion.certificates import Certificates, DrawnSamples, certified
@@ -73,7 +73,10 @@ class Motion:
         """d: 2 of drawings, 3 of motions in space."""
 
     def __repr__(self) -> str:
-        takes, where = many(len(self._learned.imitation.starts), "take"), "plane" if self.dimension == 2 else "space"
+        takes, where = (
+            many(len(self._learned.imitation.starts), "take"),
+            "the plane" if self.dimension == 2 else "space",
+        )
         layers = "".join(f", {layer.name}" for layer in self._layers)
         goal = placed(self._learned.goal[: self.dimension])
         return f"Motion({takes} in {where}, {self.state} state, goal {goal}{layers})"
@@ -343,12 +346,26 @@ def fit(
     settings = settings or ImitationSettings(objective)
     augmented = augmented or AugmentedSettings(preparation=settings.preparation)
     if goal is not None:
-        place = tuple(float(x) for x in goal)
+        place = as_place(goal, given[0].dimension, "goal")
         settings = replace(settings, preparation=replace(settings.preparation, goal=place))
         augmented = replace(augmented, preparation=replace(augmented.preparation, goal=place))
     motions = prepare(given, settings.preparation)
+    _check_goals(motions.inspections, labels)
     for text in summaries(motions.inspections):
         warnings.warn(text, DemonstrationWarning, stacklevel=2)
     imitation = learn(motions.repaired, settings, state, labels, augmented=augmented)
     learned = Learned.of(Task(demonstrations=motions.repaired), imitation, imitates=True)
     return Motion(learned, inspections=motions.inspections)
+
+
+def _check_goals(inspections: Sequence[Inspection], labels: Sequence[float] | None) -> None:
+    """Raise FormatError where all takes with a label were left out: it has a goal of its own."""
+    if labels is None or len(labels) != len(inspections):
+        return
+    kept = dict.fromkeys(labels, False)
+    for inspection, label in zip(inspections, labels, strict=True):
+        kept[label] |= inspection.kept
+    if not all(kept.values()):
+        lost = next(label for label in kept if not kept[label])
+        accepted = "labels of motions to one goal; learn the takes to each goal by themselves, with goal=… if need be"
+        raise FormatError("labels", f"{lost!r} for takes that end elsewhere than the others", accepted)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -24,10 +25,10 @@ def in_space(transform: Transform, dimension: int) -> Transform:
     """
     changes: dict[str, Any] = {}
     if isinstance(transform, Anchored):
-        changes["position"] = _point(transform, transform.position, dimension)
+        changes["position"] = _point(transform, dimension)
     elif isinstance(transform, Avoidance):
         parts = transform.obstacles
-        points = [_point(part, part.position, dimension) for part in parts]
+        points = [_point(part, dimension) for part in parts]
         if points != [part.position for part in parts]:
             changes["obstacles"] = tuple(map(_moved, parts, points))
     if isinstance(transform, Planar) and dimension == 2:
@@ -39,13 +40,22 @@ def _moved(obstacle: Obstacle, position: Point) -> Obstacle:
     return obstacle.moved(position, obstacle.wxyz)
 
 
-def _point(owner: Transform | Obstacle, position: object, dimension: int) -> Point:
+def as_place(given: Any, dimension: int, field: str) -> tuple[float, ...]:  # noqa: ANN401 - whatever was given
+    """Coordinates that were given, as many as a dimension. Raises FormatError where they are not that."""
     try:
-        given = tuple(float(x) for x in position)  # pyright: ignore[reportGeneralTypeIssues]
+        place = tuple(float(x) for x in given)
     except (TypeError, ValueError):
-        given = ()
-    if len(given) not in (dimension, 3) or not np.isfinite(given).all():
+        place = ()
+    if len(place) != dimension or not np.isfinite(place).all():
         accepted = "(x, y), metres: the motion is in the plane" if dimension == 2 else "(x, y, z), metres"
-        raise FormatError(f"position of {type(owner).__name__}", repr(position)[:80], accepted)
-    x, y, z = (*given, 0.0)[:3]
+        raise FormatError(field, repr(given)[:80], accepted)
+    return place
+
+
+def _point(owner: Anchored | Obstacle, dimension: int) -> Point:
+    """The position in space of a transform or an obstacle for a motion of a dimension."""
+    position: Any = owner.position
+    if dimension == 2 and isinstance(position, Sequence | np.ndarray) and len(position) == 3:
+        dimension = 3  # a place before or behind the plane
+    x, y, z = (*as_place(position, dimension, f"position of {type(owner).__name__}"), 0.0)[:3]
     return x, y, z

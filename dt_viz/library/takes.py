@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from numbers import Real
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -20,12 +22,17 @@ from dt_viz.learning.demonstrations import (
     load_demonstrations,
     samples_of,
 )
+from dt_viz.learning.preparation import DemonstrationWarning
 from dt_viz.scenario.tasks import TASKS
 
 Demonstrations: TypeAlias = (
     "Demonstration | ArrayLike | str | os.PathLike[str] | Mapping[str, Any] | Iterable[Any]"  # or a pandas.DataFrame
 )
 """What `fit` learns from; see there."""
+DURATION = 5.0
+"""Duration of a take without times, seconds."""
+UNTIMED = np.empty(0)
+"""Times of a take without times, until it is known whether all have some."""
 ACCEPTED = "arrays (T, 2) or (T, 3), metres, such as dt.fit([positions, …], rate=100)"
 
 
@@ -50,13 +57,16 @@ def demonstrations_of(given: Any, rate: float | None = None) -> tuple[Demonstrat
     Raises:
         DataError: it is no demonstrations.
     """
-    if rate is not None and not 0 < rate < np.inf:
-        raise FormatError("rate", f"{rate}", "samples a second, above 0")
+    if rate is not None and not (isinstance(rate, Real) and 0 < float(rate) < np.inf):
+        raise FormatError("rate", repr(rate)[:40], "samples a second, above 0")
     with naming(DemonstrationError, "demonstrations"):
         takes = list(_takes(given, rate))
         if not takes:
             raise FormatError("takes", "none", ACCEPTED)
-        named = [take if take.name else replace(take, name=f"take {k}") for k, take in enumerate(takes, 1)]
+        if any(take.times is UNTIMED for take in takes):
+            text = f"no times and no rate: each take is taken as {DURATION:g} s long; rate=…, Hz, says otherwise"
+            warnings.warn(text, DemonstrationWarning, stacklevel=3)
+        named = [_complete(take, number) for number, take in enumerate(takes, 1)]
         pairs = zip(named, samples_of(named), strict=True)
         checked = tuple(replace(take, times=times, positions=positions) for take, (times, positions) in pairs)
         farthest = np.array([np.abs(take.positions).max() for take in checked])
@@ -65,6 +75,12 @@ def demonstrations_of(given: Any, rate: float | None = None) -> tuple[Demonstrat
             accepted = f"metres, at most {MAX_COORDINATE:g} from the origin; of millimetres: positions / 1000"
             raise FormatError("positions", found, accepted)
     return checked
+
+
+def _complete(take: Demonstration, number: int) -> Demonstration:
+    """A take with times and a name."""
+    times = np.linspace(0.0, DURATION, len(take.positions)) if take.times is UNTIMED else take.times
+    return replace(take, times=times, name=take.name or f"take {number}")
 
 
 def _takes(given: Any, rate: float | None) -> Iterator[Demonstration]:  # noqa: ANN401 - whatever was given
@@ -108,13 +124,14 @@ def _of_array(given: Any, rate: float | None) -> Iterator[Demonstration]:  # noq
     try:
         array = np.asarray(given)
     except ValueError as error:
-        raise FormatError("positions", f"points of different dimension ({error})", ACCEPTED) from error
+        raise FormatError("positions", "points of different dimension", ACCEPTED) from error
     if array.dtype == object and array.ndim == 1 and len(array) and hasattr(array[0], "__len__"):
         for value in array:  # an array of arrays
             yield from _takes(value, rate)
         return
     if array.dtype.kind not in "fiu":
-        what = repr(given)[:40] if array.ndim == 0 else f"an array of {array.dtype}"
+        said = isinstance(given, str | bool | None)
+        what = repr(given)[:40] if said else f"{array.dtype} values of type {type(given).__name__}"
         raise FormatError("positions", what, ACCEPTED)
     if array.ndim not in (2, 3) or array.shape[-1] not in DIMENSIONS:
         raise FormatError("positions", f"an array of shape {array.shape}", f"{ACCEPTED}{_way_out(array)}")
@@ -134,8 +151,8 @@ def _way_out(array: Array) -> str:
 
 
 def _times(num: int, rate: float | None) -> Array:
-    """Times (T,) at a rate, Hz, or in 5 s in all."""
-    return np.arange(num) / (rate or max(num - 1, 1) / 5.0)
+    """Times (T,) at a rate, Hz; without one, times to come."""
+    return UNTIMED if rate is None else np.arange(num) / rate
 
 
 def _of_table(table: Any, rate: float | None) -> Iterator[Demonstration]:  # noqa: ANN401 - a pandas.DataFrame
