@@ -125,9 +125,9 @@ def _of_array(given: Any, rate: float | None) -> Iterator[Demonstration]:  # noq
         array = np.asarray(given)
     except ValueError as error:
         raise FormatError("positions", "points of different dimension", ACCEPTED) from error
-    if array.dtype == object and array.ndim == 1 and len(array) and hasattr(array[0], "__len__"):
-        for value in array:  # an array of arrays
-            yield from _takes(value, rate)
+    if array.dtype == object and array.ndim and len(array) and hasattr(array[0], "__len__"):
+        for value in array:  # an array of arrays, or of their rows
+            yield from _takes(value if array.ndim == 1 else value.tolist(), rate)
         return
     if array.dtype.kind not in "fiu":
         said = isinstance(given, str | bool | None)
