@@ -20,6 +20,11 @@ DEEP = np.column_stack([PATH, 0.2 * S**2])
 TIMES = S * 100 / 25
 
 
+def flat(x: float, y: float) -> Any:
+    """A place of the plane."""
+    return x, y
+
+
 class Table(dict):
     """What a pandas.DataFrame is to the library: columns by their names."""
 
@@ -175,7 +180,9 @@ def test_changes_are_warned_about_and_reported_take_by_take(tmp_path):
     assert [each.kept for each in motion.inspections] == [True, True, True, False]
     report = motion.report().splitlines()
     assert report[0] == repr(motion)
-    assert re.fullmatch(r"'draw J 0': \d.* s, \d+ samples, [\d.]+ Hz: has .*\(left out\);.* is up to .* mm off", report[1])
+    assert re.fullmatch(
+        r"'draw J 0': \d.* s, \d+ samples, [\d.]+ Hz: has .*\(left out\);.* is up to .* mm off", report[1]
+    )
     assert "ends" in report[4] and "mm off" not in report[4]
     assert len(motion.rollouts()) == 4  # also from the start of the take that is left out
     motion.save(tmp_path / "motion")
@@ -214,7 +221,7 @@ def test_values_say_in_one_line_what_they_are(drawing, deep):
         (around.rollouts()[0], r"Path\(\d+ samples, 0\.\d+ m in 4\.?\d* s\)"),
         (around.certificates(), r"Certificates\(clearance .* mm, det J ≥ .*, Lyapunov value falls, no warnings\)"),
         (dt.Avoidance(ball, space="cspace"), r"ArmAvoidance\(Sphere at \(0.1, 0.0, 0.0\) m; margin 10 mm, .*auto\)"),
-        (dt.BiasPoint((0.2, 0.1)), r"BiasPoint\(\(0.2, 0.1\) m, radius auto, strength auto\)"),
+        (dt.BiasPoint(flat(0.2, 0.1)), r"BiasPoint\(\(0.2, 0.1\) m, radius auto, strength auto\)"),
         (dt.Demonstration(TIMES, PATH, "one"), r"Demonstration\('one': 101 samples of 2 coordinates, 4 s\)"),
         (arm, r"Arm\(.*6 joints.*\)"),
         (arm.follow(path), r"JointPath\(\d+ samples of 6 joints, .* s, hand .* mm off\)"),
@@ -232,11 +239,11 @@ def test_values_say_in_one_line_what_they_are(drawing, deep):
 
 def test_motions_in_the_plane_take_places_of_the_plane(drawing):
     x, y = drawing.rollouts()[0].positions[80]
-    near, flat = dt.BiasPoint((x, y + 0.02)), dt.BiasPoint((x, y + 0.02, 0.0))
+    near, same = dt.BiasPoint(flat(x, y + 0.02)), dt.BiasPoint((x, y + 0.02, 0.0))
     np.testing.assert_array_equal(
-        drawing.stack(near).rollouts()[0].positions, drawing.stack(flat).rollouts()[0].positions
+        drawing.stack(near).rollouts()[0].positions, drawing.stack(same).rollouts()[0].positions
     )
-    around = drawing.stack(near, dt.Avoidance([dt.Sphere((x, y), 0.05), dt.Box((0.0, 0.3), (0.1, 0.1, 0.1))]))
+    around = drawing.stack(near, dt.Avoidance([dt.Sphere(flat(x, y), 0.05), dt.Box(flat(0.0, 0.3), (0.1, 0.1, 0.1))]))
     assert around.certificates().clearance > 0.0085
     assert around.transforms[1].avoided.parts[1].position == (0.0, 0.3, 0.0)
 
@@ -245,11 +252,11 @@ def test_motions_in_the_plane_take_places_of_the_plane(drawing):
     ("transform", "words"),
     [
         (
-            dt.BiasPoint(cast(Any, (0.1, 0.2))),
+            dt.BiasPoint(flat(0.1, 0.2)),
             r"position of BiasPoint: found \(0.1, 0.2\); accepted: \(x, y, z\), metres",
         ),
         (
-            dt.Avoidance(dt.Sphere(cast(Any, (0.1, 0.2)))),
+            dt.Avoidance(dt.Sphere(flat(0.1, 0.2))),
             r"position of Sphere: found \(0.1, 0.2\); accepted: \(x, y, z\)",
         ),
         (dt.BiasPoint(cast(Any, "abc")), "position of BiasPoint: found 'abc'"),

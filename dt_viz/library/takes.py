@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from numbers import Real
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -88,7 +89,7 @@ def _takes(given: Any, rate: float | None) -> Iterator[Demonstration]:  # noqa: 
     if isinstance(given, Demonstration):
         yield given
     elif isinstance(given, str | os.PathLike):
-        yield from load_demonstrations(given, rate=rate)
+        yield from load_demonstrations(Path(given), rate=rate)
     elif hasattr(given, "columns"):
         yield from _of_table(given, rate)
     elif isinstance(given, Mapping):

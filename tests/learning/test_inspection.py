@@ -1,12 +1,13 @@
 """What is odd about takes is found, said and repaired; what is not odd stays as it is, to the last bit."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from corrupted import CORRUPTIONS, NOISE, corrupted, elsewhere, noise, sampled, slower
 from crossings import crossings
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.inspection import PreparationSettings
@@ -26,7 +27,7 @@ def found(motions):
 def off(takes, clean):
     """Largest distance of samples of takes from the paths of clean ones, metres."""
     return max(
-        cKDTree(resample_by_arc_length(own.positions, 2000)).query(take.positions)[0].max()
+        KDTree(resample_by_arc_length(own.positions, 2000)).query(take.positions)[0].max()
         for take, own in zip(takes, clean, strict=True)
     )
 
@@ -69,7 +70,9 @@ def test_a_corruption_is_found_by_its_kind_and_repaired(task, name, rate):
 def test_each_repair_has_a_switch(name):
     switch = {"outliers": "drop_outliers", "pauses": "cut_pauses"}.get(name, "smooth_jitter")
     takes = corrupted(TASKS["push_box"]().demonstrations[:6], [name], 100, seed=3)
-    repairs = dict.fromkeys(["smooth_jitter", "cut_pauses", switch], False)  # outliers look like jitter and pauses
+    repairs: dict[str, Any] = dict.fromkeys(
+        ["smooth_jitter", "cut_pauses", switch], False
+    )  # outliers look like jitter and pauses
     motions = prepare(takes, PreparationSettings(**repairs))
     assert KINDS[name] in found(motions)
     for take, own in zip(motions.repaired, takes, strict=True):
@@ -157,7 +160,7 @@ def misses(imitation, takes):
     found = []
     for path, own in zip(rollouts(imitation, takes), takes, strict=True):
         ends = resample_by_arc_length(path, 1000), resample_by_arc_length(own.positions, 1000)
-        found.append(max(cKDTree(a).query(b)[0].max() for a, b in (ends, ends[::-1])))
+        found.append(max(KDTree(a).query(b)[0].max() for a, b in (ends, ends[::-1])))
     return np.array(found)
 
 
