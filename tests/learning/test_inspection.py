@@ -86,6 +86,8 @@ def test_a_gap_is_bridged_by_a_curve_unless_that_is_switched_off():
     assert all(len(take.times) > len(own.times) for take, own in zip(motions.repaired, takes, strict=True))
     straight = prepare(takes, PreparationSettings(bridge_gaps=False))
     assert all(take is own for take, own in zip(straight.repaired, takes, strict=True))
+    uneven = corrupted(TASKS["draw_j"]().demonstrations[:6], [*KINDS][:4], 5, seed=149)
+    assert all((np.diff(take.times) > 0.01).all() for take in prepare(uneven).repaired)
     assert "straight line" in straight.warnings[0] and "curve" in motions.warnings[0]
 
 
