@@ -58,6 +58,8 @@ class PreparationSettings:
     outlier: float = 3.0
     """Least length of the jumps to an outlier and back, relative to a long step (the 75 % quantile) of the take. The
     longest step of clean takes is 2.2, at any rate."""
+    smallest_outlier: float = 0.03
+    """Least length of these jumps, relative to the take's size, twice the median distance from its middle."""
     jitter: float = 1.05
     """Least factor by which jitter makes a take longer. Clean takes get shorter by 1.1 % when they are smoothed."""
     cutoff: float = 5.0
@@ -176,13 +178,13 @@ def repair(takes: Sequence[Take], settings: PreparationSettings) -> None:
 def _find_units(takes: Sequence[Take], settings: PreparationSettings) -> None:
     """Look for takes in millimetres among takes in metres."""
     sizes = np.array([np.ptp(take.positions, axis=0).max() for take in takes])
-    others = np.median(sizes)
+    others = np.quantile(sizes, 0.5, method="lower")
     for take, size in zip(takes, sizes, strict=True):
-        if others > 0 and 300 < size / others < 3000:
+        if others > 0 and 300 < size / others < 3000:  # a thousand times, where takes differ by a factor of three
             text = f"spans {size:.3g} m, the others {others:.3g} m: it is in millimetres, as it seems"
             take.find("units", text, "it is converted to metres" if settings.convert_units else "")
             take.positions = take.positions / 1e3 if settings.convert_units else take.positions
-        elif size > 10:
+        elif size > 10:  # no arm reaches that far
             take.find("units", f"spans {size:.3g} m; if it is in millimetres, divide positions by 1,000")
 
 
@@ -192,12 +194,12 @@ def _find_outliers(take: Take, settings: PreparationSettings) -> None:
         return
     usual = np.quantile(steps[steps > 1e-6 * steps.max()], 0.75)
     size = 2 * np.median(np.linalg.norm(take.positions - np.median(take.positions, axis=0), axis=1))
-    least = max(settings.outlier * usual, 0.03 * size)
+    least = max(settings.outlier * usual, settings.smallest_outlier * size)
     off = np.zeros(len(take.positions), bool)
-    for num in (1, 2, 3):  # successive outliers
+    for num in (1, 2, 3):  # of successive outliers
         jump = np.minimum(steps[:-num], steps[num:])
         across = np.linalg.norm(take.positions[num + 1 :] - take.positions[: -num - 1], axis=1)
-        for first in np.flatnonzero((jump > least) & (across < 0.8 * jump)):
+        for first in np.flatnonzero((jump > least) & (across < 0.8 * jump)):  # there and back
             off[first + 1 : first + 1 + num] = True
     off[0] |= steps[0] > least > 2 * steps[1]
     off[-1] |= steps[-1] > least > 2 * steps[-2]
@@ -248,7 +250,7 @@ def _without_jitter(take: Take, grid: _Grid, settings: PreparationSettings) -> A
         return None
     take.jitter = noise
     take.find("jitter", f"jitters by {in_millimetres(take.jitter)}", "smoothed" if settings.smooth_jitter else "")
-    while cutoff * duration > 2:
+    while cutoff * duration > 2:  # oscillations of the whole take
         smoother, more = grid.smoothed(cutoff / 1.5)
         left = 2.22 * cutoff * duration / len(take.times)  # part of the variance that passes, ∫ 1/(1 + (f/cutoff)⁴)
         if (more / noise) ** 2 > 1 + min(left, 0.1):  # more motion would be taken out than noise is left
