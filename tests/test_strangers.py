@@ -198,13 +198,15 @@ def test_clean_takes_are_learned_without_a_warning():
     assert motion.report().count("as it should be") == len(takes)
 
 
-def test_the_goal_can_be_chosen_among_the_ends_and_labels_do_not_stand_for_goals():
+def test_the_goal_can_be_chosen_among_the_ends_and_labels_do_not_stand_for_goals(tmp_path):
     takes = [PATH, PATH, PATH + 0.3, PATH + 0.3]
     with pytest.raises(dt.ImitationError, match=r"'take 1', 'take 2' at .*; 'take 3', 'take 4' at .*goal=…"):
         dt.fit(takes, rate=25)
     with pytest.warns(dt.DemonstrationWarning, match="'take 1' ends 424 mm from the goal; it is left out"):
         motion = dt.fit(takes, rate=25, goal=PATH[-1] + 0.3, state="augmented")
     np.testing.assert_array_equal(motion.goal, PATH[-1] + 0.3)
+    motion.save(tmp_path / "motion")
+    np.testing.assert_array_equal(dt.Motion.load(tmp_path / "motion").goal, motion.goal)
     with pytest.raises(dt.FormatError, match="labels: found 1 for takes that end elsewhere"):
         dt.fit([PATH, *takes], rate=25, labels=[0, 0, 0, 1, 1])
 
