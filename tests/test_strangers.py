@@ -224,7 +224,7 @@ def test_values_say_in_one_line_what_they_are(drawing, deep):
         (around.certificates(), r"Certificates\(clearance .* mm, det J ≥ .*, Lyapunov value falls, no warnings\)"),
         (dt.Avoidance(ball, space="cspace"), r"ArmAvoidance\(Sphere at \(0.1, 0.0, 0.0\) m; margin 10 mm, .*auto\)"),
         (dt.BiasPoint(flat(0.2, 0.1)), r"BiasPoint\(\(0.2, 0.1\) m, radius auto, strength auto\)"),
-        (dt.Demonstration(TIMES, PATH, "one"), r"Demonstration\('one': 101 samples of 2 coordinates, 4 s\)"),
+        (dt.Demonstration(TIMES, PATH, "one"), r"Demonstration\('one': 101×2 positions, metres, 4 s\)"),
         (arm, r"Arm\(.*6 joints.*\)"),
         (arm.follow(path), r"JointPath\(\d+ samples of 6 joints, .* s, hand .* mm off\)"),
         (dt.Controller(push, arm), r"Controller\(Motion\(.*\)\)"),
@@ -232,6 +232,7 @@ def test_values_say_in_one_line_what_they_are(drawing, deep):
     ):
         assert re.fullmatch(words, repr(value)), repr(value)
         assert len(repr(value)) < 250
+    assert repr(dt.Demonstration(cast(Any, None), cast(Any, None))) == "Demonstration('':  positions, metres)"
     for value in (ball, dt.ControllerSettings(), dt.ImitationSettings(), dt.TrackingSettings(), dt.Integration()):
         assert "\n" not in repr(value) and "0x" not in repr(value) and "array" not in repr(value)
 

@@ -92,8 +92,9 @@ class Demonstration:
         return float(self.times[-1])
 
     def __repr__(self) -> str:
-        num, coordinates = np.shape(self.positions)[0], np.shape(self.positions)[-1]
-        return f"Demonstration({self.name!r}: {num} samples of {coordinates} coordinates, {self.times[-1]:.3g} s)"
+        shape = "×".join(map(str, np.shape(self.positions)))
+        duration = f", {self.times[-1] - self.times[0]:.3g} s" if np.size(self.times) > 1 else ""
+        return f"Demonstration({self.name!r}: {shape} positions, metres{duration})"
 
 
 class DemonstrationError(DataError):
