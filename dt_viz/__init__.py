@@ -2,7 +2,7 @@
 
     import dt_viz as dt
 
-    motion = dt.fit(dt.load_demonstrations("push_box.npz"))
+    motion = dt.fit(dt.example("push_box"))
     around = motion.stack(dt.Avoidance(dt.Sphere((0.10, -0.53, 0.15), diameter=0.15)))
     paths = around.rollouts()
 
@@ -24,11 +24,13 @@ if TYPE_CHECKING:
     from dt_viz.flows.diffeomorphisms import Integration
     from dt_viz.learning.demonstrations import Demonstration, load_demonstrations
     from dt_viz.learning.imitation import ImitationSettings
+    from dt_viz.learning.inspection import Finding, Inspection, PreparationSettings
     from dt_viz.learning.patterns import AugmentedSettings
-    from dt_viz.learning.preparation import ImitationError
+    from dt_viz.learning.preparation import DemonstrationWarning, ImitationError
     from dt_viz.library.arm import Arm, BlockedError, Controller, JointPath, load_jaco
     from dt_viz.library.hand import HandController
     from dt_viz.library.motion import Motion, Path, fit
+    from dt_viz.library.takes import example
     from dt_viz.motion.certificates import Certificates
     from dt_viz.obstacles.shapes import Box, Cylinder, Sphere
     from dt_viz.robot.tracking_settings import TrackingSettings
@@ -48,19 +50,24 @@ __all__ = [
     "Cylinder",
     "DataError",
     "Demonstration",
+    "DemonstrationWarning",
+    "Finding",
     "FormatError",
     "HandAvoidance",
     "HandController",
     "ImitationError",
     "ImitationSettings",
+    "Inspection",
     "Integration",
     "JointPath",
     "Motion",
     "MotionWarning",
     "Path",
+    "PreparationSettings",
     "Sphere",
     "TrackingSettings",
     "Transform",
+    "example",
     "fit",
     "load_demonstrations",
     "load_jaco",
@@ -73,10 +80,12 @@ _MODULES = {
     "learning.demonstrations": ("Demonstration", "load_demonstrations"),
     "learning.imitation": ("ImitationSettings",),
     "learning.patterns": ("AugmentedSettings",),
-    "learning.preparation": ("ImitationError",),
+    "learning.inspection": ("Finding", "Inspection", "PreparationSettings"),
+    "learning.preparation": ("DemonstrationWarning", "ImitationError"),
     "library.arm": ("Arm", "BlockedError", "Controller", "JointPath", "load_jaco"),
     "library.hand": ("HandController",),
     "library.motion": ("Motion", "Path", "fit"),
+    "library.takes": ("example",),
     "motion.certificates": ("Certificates",),
     "obstacles.shapes": ("Box", "Cylinder", "Sphere"),
     "avoidance.avoidance": ("ArmAvoidance",),

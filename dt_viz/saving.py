@@ -14,7 +14,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from types import UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
@@ -31,6 +31,7 @@ from dt_viz.files.npz import arrays_of, npz_bytes, write_whole
 from dt_viz.learning.augmented import AugmentedImitation, fit_augmented
 from dt_viz.learning.demonstrations import MAX_COORDINATE, Demonstration, check_demonstrations
 from dt_viz.learning.imitation import Imitation
+from dt_viz.learning.inspection import Inspection
 from dt_viz.learning.interface import AnyImitation
 from dt_viz.learning.patterns import AugmentedSettings
 from dt_viz.learning.preparation import ImitationError
@@ -72,6 +73,8 @@ class SavedMotion:
     """Why it was learned in the augmented state, if nobody asked for that."""
     settings: AugmentedSettings = field(default_factory=AugmentedSettings)
     """Settings of the augmented state."""
+    inspections: tuple[Inspection, ...] = ()
+    """What was found about the demonstrations before they were repaired."""
 
 
 def save_motion(path: str | os.PathLike[str], motion: SavedMotion, imitation: AnyImitation) -> None:
@@ -132,7 +135,7 @@ def read_motion(content: bytes, source: str | Path) -> tuple[SavedMotion, AnyImi
             for obstacle in layer.transform.avoided.parts:
                 check_between("distance of an obstacle", float(np.linalg.norm(obstacle.position)), 0.0, MAX_COORDINATE)
                 check_between("length of its quaternion", float(np.linalg.norm(obstacle.wxyz)), 1e-3, 1e3)
-    return SavedMotion(demonstrations, motion.layers), imitation
+    return replace(motion, demonstrations=demonstrations), imitation
 
 
 def _again(motion: SavedMotion) -> AugmentedImitation:

@@ -178,7 +178,7 @@ def test_the_example_of_the_readme_runs(monkeypatch, capsys, tmp_path):
     exec(compile(code, "README.md", "exec"), found)
     assert found["ball"] == BALL and found["joints"].error.max() < 1e-3
     assert dt.Motion.load("around.npz").transforms == found["around"].transforms
-    assert "Certificates(clearance=0.0" in capsys.readouterr().out
+    assert "Certificates(clearance " in capsys.readouterr().out
 
 
 def test_the_controller_arrives_also_when_it_is_pushed(push):

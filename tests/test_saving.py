@@ -194,7 +194,7 @@ def test_a_new_transform_of_one_file_and_one_line_is_saved_without_code_of_its_o
     ("wrong", "words"),
     [
         (dt.Avoidance(dt.Sphere((0.0, 1e9, 0.0))), "distance of an obstacle: found 1e+09; accepted: 0 to 100"),
-        (dt.BiasPoint((0.0, np.nan, 0.0)), "position[1]: found nan; accepted: a finite number"),
+        (dt.Avoidance(dt.Box((0.0, 0.0, 0.0), wxyz=(np.nan, 0.0, 0.0, 1.0))), "wxyz[0]: found nan; accepted: a finite"),
     ],
 )
 def test_what_could_not_be_read_is_not_written(flat, tmp_path, wrong, words):

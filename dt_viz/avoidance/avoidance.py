@@ -7,6 +7,8 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, ClassVar, Literal, TypeVar, get_args
 
+import numpy as np
+
 from dt_viz.avoidance.detour import DETOUR, DetourSettings
 from dt_viz.avoidance.transform import MOST_DURATION, Built, MotionBelow, Transform
 from dt_viz.errors import FormatError, check_between
@@ -21,7 +23,7 @@ SPACES: tuple[Space, ...] = get_args(Space)
 _Kind = TypeVar("_Kind", bound="Avoidance")
 
 
-@dataclass(frozen=True, init=False)
+@dataclass(frozen=True, init=False, repr=False)
 class Avoidance(Transform):
     """Motions are led around obstacles, by a flow on the gradient of their occupancy.
 
@@ -84,6 +86,14 @@ class Avoidance(Transform):
         own |= {"generator": generator, "integration": integration, "detour": detour}
         for name, value in own.items():
             object.__setattr__(self, name, value)
+
+    def __repr__(self) -> str:
+        parts = ", ".join(
+            f"{type(part).__name__} at {tuple(np.round(part.position, 4).tolist())} m" for part in self.obstacles
+        )
+        time = "auto" if self.duration is None else f"{self.duration:g}"
+        how = f"margin {1e3 * self.margin:g} mm, {self.generator}, T {self.temperature:g}, flow time {time}"
+        return f"{type(self).__name__}({parts or 'no obstacles'}; {how})"
 
     def changed(self, space: Space | None = None, **changes: Any) -> Avoidance:  # noqa: ANN401 - any fields
         """Return the avoidance with fields replaced, of the kind that acts in a space; None keeps its kind."""

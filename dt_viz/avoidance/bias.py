@@ -51,7 +51,7 @@ MAX_TARGET_MISS = 0.013
 error of the arm's joints, interpolated between samples, during a drag."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class BiasPoint(Anchored):
     """Motions are pulled towards a place.
 
@@ -82,6 +82,13 @@ class BiasPoint(Anchored):
             check_between("radius", self.radius, 1e-3, 100.0)
         if self.strength is not None:
             check_between("strength", self.strength, 0.0, MOST_DURATION)
+
+    def __repr__(self) -> str:
+        radius = "auto" if self.radius is None else f"{self.radius:g} m"
+        strength = "auto" if self.strength is None else f"{self.strength:g}"
+        goal = ", moves the goal" if self.moves_goal else ""
+        place = tuple(np.round(self.position, 4).tolist())
+        return f"BiasPoint({place} m, radius {radius}, strength {strength}{goal})"
 
     def axes(self) -> Array:
         """(3, 3) orthonormal columns, those of the plane first."""

@@ -41,7 +41,7 @@ TAIL = 2.0
 place: such a path arrives at up to 60° from the straight escape."""
 
 
-@dataclass(frozen=True, init=False)
+@dataclass(frozen=True, init=False, repr=False)
 class HandAvoidance(Avoidance, Planar, space="task"):
     """The end effector avoids (sec. 4.4)."""
 

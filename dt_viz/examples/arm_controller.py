@@ -8,7 +8,6 @@ from __future__ import annotations
 import numpy as np
 
 import dt_viz as dt
-from dt_viz.shipped import ASSETS
 
 PERIOD = 0.01
 """Time between two commands, seconds: 100 Hz."""
@@ -38,7 +37,7 @@ def run(motion: dt.Motion, arm: dt.Arm, seconds: float = 12.0) -> tuple[np.ndarr
 
 def main() -> None:
     """Print how near the ball came, and where the hand is in the end."""
-    arm, motion = dt.load_jaco(), dt.fit(dt.load_demonstrations(ASSETS / "push_box.npz"))
+    arm, motion = dt.load_jaco(), dt.fit(dt.example("push_box"))
     joints, places = run(motion, arm)
     hand = arm.robot.end_effector(joints)
     distance = np.linalg.norm(hand - places, axis=1).min() - 0.075

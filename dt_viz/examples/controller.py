@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 
 import dt_viz as dt
-from dt_viz.shipped import ASSETS
 
 PERIOD = 0.01
 """Time between two commands, seconds: 100 Hz."""
@@ -42,7 +41,7 @@ def main(file: str | None = None) -> None:
     if file is not None and Path(file).exists():
         around = dt.Motion.load(file)
     else:
-        motion = dt.fit(dt.load_demonstrations(ASSETS / "push_box.npz"))
+        motion = dt.fit(dt.example("push_box"))
         around = motion.stack(dt.Avoidance(ball, margin=0.02))
         if file is not None:
             around.save(file)

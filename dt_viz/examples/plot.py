@@ -10,7 +10,6 @@ import sys
 import numpy as np
 
 import dt_viz as dt
-from dt_viz.shipped import ASSETS
 
 
 def main(file: str | None = None) -> None:
@@ -19,7 +18,7 @@ def main(file: str | None = None) -> None:
     from matplotlib.patches import Circle  # noqa: PLC0415
 
     # %% Learn
-    demonstrations = dt.load_demonstrations(ASSETS / "draw_s.npz")
+    demonstrations = dt.example("draw_s")
     motion = dt.fit(demonstrations, state="plain")  # one velocity field, which is plotted
 
     # %% A ball in the middle of the first path

@@ -11,7 +11,6 @@ import numpy as np
 import viser
 
 import dt_viz as dt
-from dt_viz.shipped import ASSETS
 
 DIAMETER = 0.15
 """Diameter of the ball, metres."""
@@ -41,7 +40,7 @@ class Scene:
 
 def main() -> None:
     """Serve the scene until it is interrupted."""
-    motion = dt.fit(dt.load_demonstrations(ASSETS / "lift_box.npz"))
+    motion = dt.fit(dt.example("lift_box"))
     Scene(viser.ViserServer(), motion)
     while True:
         time.sleep(1.0)

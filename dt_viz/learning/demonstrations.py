@@ -79,7 +79,7 @@ class Demonstration:
 
     times: np.ndarray
     positions: np.ndarray
-    name: str
+    name: str = ""
 
     @property
     def dimension(self) -> int:
@@ -90,6 +90,11 @@ class Demonstration:
     def duration(self) -> float:
         """Time from the first to the last sample, seconds."""
         return float(self.times[-1])
+
+    def __repr__(self) -> str:
+        shape = "×".join(map(str, np.shape(self.positions)))
+        duration = f", {self.times[-1] - self.times[0]:.3g} s" if np.size(self.times) > 1 else ""
+        return f"Demonstration({self.name!r}: {shape} positions, metres{duration})"
 
 
 class DemonstrationError(DataError):

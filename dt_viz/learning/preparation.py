@@ -12,7 +12,9 @@ from dt_viz.errors import FormatError
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.demonstrations import Demonstration, samples_of
+from dt_viz.learning.inspection import Inspection, PreparationSettings, Take, repair
 from dt_viz.metrics import arc_length, discrete_frechet, resample_by_arc_length
+from dt_viz.warning import in_millimetres
 
 DECIDING = 1e-3  # deviation that points are given along a way, in spreads, to decide between axes that are alike
 
@@ -21,20 +23,8 @@ class ImitationError(ValueError):
     """Demonstrations from which no stable system can be learned; the message names the demonstration and the reason."""
 
 
-@dataclass(frozen=True)
-class PreparationSettings:
-    """Settings of the preparation. Lengths are in spreads, the RMS distance of all points from their mean."""
-
-    same_goal: float = 1e-3
-    """Distance from the goal up to which an end is at the goal."""
-    max_moved_end: float = 0.3
-    """Distance from the goal up to which an end is moved there; farther ones are left out."""
-    at_goal: float = 0.05
-    """Distance from the goal up to which a start is at the goal."""
-    standing_step: float = 1e-3
-    """Length of a step, lasting 1 % of the motion, below which the motion stands still."""
-    long_stand: float = 0.1
-    """Part of the duration from which standing still is reported."""
+class DemonstrationWarning(UserWarning):
+    """Something odd about demonstrations, and what was done about it."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +42,15 @@ class Motions:
     """(d,) common end."""
     spread: float
     """RMS distance of all points from their mean."""
-    warnings: tuple[str, ...]
-    """Descriptions of the changes to the demonstrations."""
+    inspections: tuple[Inspection, ...]
+    """What was found out about each demonstration, also about those that are left out."""
+    repaired: tuple[Demonstration, ...]
+    """All demonstrations without outliers, gaps, jitter and pauses; their ends are where they were, but for jitter."""
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Descriptions of what was found, and of the changes to the demonstrations."""
+        return tuple(warning for inspection in self.inspections for warning in inspection.warnings)
 
     @cached_property
     def crossing(self) -> tuple[str, ...]:
@@ -119,77 +116,124 @@ class Motions:
 
 
 def prepare(demonstrations: Sequence[Demonstration], settings: PreparationSettings | None = None) -> Motions:
-    """Check demonstrations and give them a common goal; None takes the default settings.
+    """Inspect demonstrations, repair them and give them a common goal; None takes the default settings.
 
     Raises:
-        ImitationError: there are none, they are damaged, or most do not end at one place.
+        ImitationError: there are none, they are damaged, or most do not end at one place, or at the goal that is given.
     """
     settings = settings or PreparationSettings()
     try:
         samples = samples_of(demonstrations)
     except FormatError as error:
         raise ImitationError(str(error)) from error
-    warnings: list[str] = []
-    usable: dict[int, Demonstration] = {}
-    for number, (demonstration, (times, positions)) in enumerate(zip(demonstrations, samples, strict=True)):
-        if arc_length(positions)[-1] > 0:
-            usable[number] = Demonstration(times, positions, demonstration.name)
-        else:
-            warnings.append(f"'{demonstration.name}' never moves; it is left out")
-    if not usable:
+    takes = [Take(own, *sample) for own, sample in zip(demonstrations, samples, strict=True)]
+    for take in takes:
+        if not arc_length(take.positions)[-1] > 0:
+            take.leave_out("still", "never moves")
+    moving = [take for take in takes if take.kept]
+    if not moving:
         raise ImitationError("no demonstration moves; at least one must lead to the goal")
-    spread = _spread(list(usable.values()))
-    usable, goal = _with_common_goal(usable, spread, settings, warnings)
-
-    kept: dict[int, Demonstration] = {}
-    for number, demonstration in usable.items():
-        t, path = demonstration.times, _end_moved(demonstration.positions, goal)
-        away = np.flatnonzero(np.linalg.norm(path - goal, axis=1) > settings.at_goal * spread)
-        if len(away) == 0:
-            warnings.append(f"'{demonstration.name}' stays at the goal; it is left out")
-            continue
-        if np.linalg.norm(path[0] - goal) <= settings.at_goal * spread:
-            first = away[0]
-            warnings.append(
-                f"'{demonstration.name}' starts at the goal, where a stable motion ends; "
-                f"its first {t[first]:.2g} s are left out"
-            )
-            t, path = t[first:] - t[first], path[first:]
-        if standing := _stands_still(demonstration.name, t, path, spread, settings):
-            warnings.append(standing)
-        kept[number] = Demonstration(t, path, demonstration.name)
+    repair(moving, settings)
+    spread = _spread(moving)
+    goal = _common_goal(moving, spread, settings)
+    repaired = tuple(take.repaired for take in takes)
+    for take in moving:
+        if take.kept:
+            _lead_to_goal(take, goal, settings.at_goal * spread)
+    kept = {number: take for number, take in enumerate(takes) if take.kept}
     if not kept:
         raise ImitationError("every demonstration starts at the goal and stays there; there is nothing to learn")
-    names, times, positions = zip(*((one.name, one.times, one.positions) for one in kept.values()), strict=True)
-    return Motions(tuple(kept), names, times, positions, goal, spread, tuple(warnings))
+    names = tuple(take.demonstration.name for take in kept.values())
+    times, positions = zip(*((take.times, take.positions) for take in kept.values()), strict=True)
+    inspections = tuple(take.inspection for take in takes)
+    return Motions(tuple(kept), names, times, positions, goal, spread, inspections, repaired)
 
 
-def _spread(demonstrations: Sequence[Demonstration]) -> float:
-    points = np.concatenate([resample_by_arc_length(demonstration.positions, 100) for demonstration in demonstrations])
+def _spread(takes: Sequence[Take]) -> float:
+    points = np.concatenate([resample_by_arc_length(take.positions, 100) for take in takes])
     return float(np.sqrt(points.var(axis=0).sum()))
 
 
-def _with_common_goal(
-    demonstrations: dict[int, Demonstration], spread: float, settings: PreparationSettings, warnings: list[str]
-) -> tuple[dict[int, Demonstration], Array]:
-    """Return the demonstrations that end where most of them do, and that goal."""
-    found = list(demonstrations.values())
-    ends = np.array([demonstration.positions[-1] for demonstration in found])
-    near = np.linalg.norm(ends - np.median(ends, axis=0), axis=1) <= settings.max_moved_end * spread
-    if 2 * near.sum() <= len(ends):
-        farthest = found[int(np.argmax(np.linalg.norm(ends - np.median(ends, axis=0), axis=1)))]
-        raise ImitationError(
-            f"the demonstrations have no common goal: most end more than "
-            f"{settings.max_moved_end * spread:.2g} from where the others do, '{farthest.name}' the farthest"
-        )
-    goal = ends[near].mean(axis=0)
-    for demonstration, end, kept in zip(found, ends, near, strict=True):
+def _common_goal(takes: Sequence[Take], spread: float, settings: PreparationSettings) -> Array:
+    """Find the goal (d,), which is given or where most takes end, and leave out those that end elsewhere."""
+    ends = np.array([take.positions[-1] for take in takes])
+    reach = settings.max_moved_end * spread
+    if settings.goal is not None:
+        goal = _given_goal(settings.goal, ends, reach)
+    else:
+        near = np.linalg.norm(ends - np.median(ends, axis=0), axis=1) <= reach
+        if 2 * near.sum() <= len(ends):
+            around = np.linalg.norm(ends[:, None] - ends, axis=-1) <= reach
+            near = around[around.sum(axis=1).argmax()]
+        if 2 * near.sum() <= len(ends):
+            raise ImitationError(_no_common_goal(takes, ends, reach))
+        goal = ends[near].mean(axis=0)
+        if not settings.move_ends:
+            goal = ends[np.linalg.norm(ends - goal, axis=1).argmin()]
+    for take, end in zip(takes, ends, strict=True):
         off = float(np.linalg.norm(end - goal))
-        if not kept:
-            warnings.append(f"'{demonstration.name}' ends {off:.2g} from the others' goal; it is left out")
-        elif off > settings.same_goal * spread:
-            warnings.append(f"'{demonstration.name}' ends {off:.2g} from the common goal; its end is moved there")
-    return {number: d for (number, d), kept in zip(demonstrations.items(), near, strict=True) if kept}, goal
+        text = f"ends {in_millimetres(off)} from the {'goal' if settings.goal else 'common goal'}"
+        if off > reach and settings.leave_out:
+            take.leave_out("elsewhere", text)
+        elif 0 < off <= take.jitter:
+            take.positions = _end_moved(take.positions, goal)
+        elif off <= settings.same_goal * spread:
+            continue
+        elif not settings.move_ends:
+            take.leave_out("end", text)
+        else:
+            take.find("end", text, "its end is moved there")
+    if not any(take.kept for take in takes):
+        raise ImitationError("no demonstration ends at the goal; accepted: move_ends=True, which moves ends there")
+    return goal
+
+
+def _given_goal(given: Sequence[float], ends: Array, reach: float) -> Array:
+    goal = np.asarray(given, float)
+    if goal.shape != ends.shape[1:] or not np.isfinite(goal).all():
+        raise ImitationError(f"goal: found {given}; accepted: {ends.shape[1]} finite numbers, metres")
+    off = np.linalg.norm(ends - goal, axis=1)
+    if off.min() > reach:
+        nearest = _place(ends[off.argmin()])
+        raise ImitationError(
+            f"goal: found {_place(goal)}, at which no demonstration ends; accepted: a place within "
+            f"{in_millimetres(reach)} of an end, such as {nearest}"
+        )
+    return goal
+
+
+def _no_common_goal(takes: Sequence[Take], ends: Array, reach: float) -> str:
+    """Say which takes end where, and how to choose."""
+    left, groups = np.ones(len(ends), bool), []
+    while left.any():
+        around = (np.linalg.norm(ends[:, None] - ends, axis=-1) <= reach) & left
+        group = np.flatnonzero(around[(around.sum(axis=1) * left).argmax()])
+        left[group] = False
+        names = ", ".join(f"'{takes[k].demonstration.name}'" for k in group[:3])
+        more = f" and {len(group) - 3} more" if len(group) > 3 else ""
+        groups.append(f"{names}{more} at {_place(ends[group].mean(axis=0))}")
+    several = f" and {len(groups) - 4} more places" if len(groups) > 4 else ""
+    return (
+        f"the demonstrations have no common goal, they end at {'; '.join(groups[:4])}{several}. "
+        f"Choose one of these places as the goal (goal=…), or learn the takes of each place by themselves"
+    )
+
+
+def _place(point: Array) -> str:
+    return f"({', '.join(f'{x:.3g}' for x in point)}) m"
+
+
+def _lead_to_goal(take: Take, goal: Array, near: float) -> None:
+    """Move the end of a take to the goal, and let it begin away from it, at more than the distance `near`, metres."""
+    take.positions = path = _end_moved(take.positions, goal)
+    away = np.flatnonzero(np.linalg.norm(path - goal, axis=1) > near)
+    if len(away) == 0:
+        take.leave_out("start", "stays at the goal")
+    elif np.linalg.norm(path[0] - goal) <= near:
+        first = away[0]
+        text = "starts at the goal, where a stable motion ends"
+        take.find("start", text, f"its first {take.times[first]:.2g} s are left out")
+        take.times, take.positions = take.times[first:] - take.times[first], path[first:]
 
 
 def _end_moved(path: Array, goal: Array) -> Array:
@@ -198,16 +242,6 @@ def _end_moved(path: Array, goal: Array) -> Array:
     moved = path + (length / length[-1])[:, None] ** 2 * (goal - path[-1])
     moved[-1] = goal
     return moved
-
-
-def _stands_still(name: str, t: Array, path: Array, spread: float, settings: PreparationSettings) -> str:
-    """The warning about a motion that stands still for long; empty where it does not."""
-    even = np.linspace(t[0], t[-1], 101)
-    steps = np.linalg.norm(np.diff([np.interp(even, t, x) for x in path.T], axis=1), axis=0)
-    standing = float((steps[1:-1] < settings.standing_step * spread).mean())
-    if standing <= settings.long_stand:
-        return ""
-    return f"'{name}' stands still for {standing * t[-1]:.2g} s; the learned motion only slows down there"
 
 
 def _crosses_itself(path: Array) -> bool:

@@ -91,7 +91,7 @@ def learn(
     if state == "augmented" or labels is not None:
         return fit_augmented(demonstrations, labels, augmented)
     choice, augmented = choice or ChoiceSettings(), augmented or AugmentedSettings()
-    motions, found, begun = prepare(demonstrations), None, 0.0
+    motions, found, begun = prepare(demonstrations, settings.preparation), None, 0.0
     if len(motions.numbers) >= choice.fewest:
         begun = choice.part
         found = leaving_out(motions, choice, augmented, lambda done, message: progress(begun * done, message))
@@ -99,7 +99,7 @@ def learn(
         reason = f"it is nearer to what it has not learned from ({found})"
     else:
         plain = cache(lambda settings: given(settings, lambda d, message: progress(begun + (1 - begun) * d, message)))
-        reason = _why_not(motions, plain)
+        reason = _why_not(motions, plain, ImitationSettings(preparation=settings.preparation))
         if not reason:
             return replace(plain(settings), choice=found)
     progress(1.0, "done")
@@ -154,9 +154,8 @@ def _mean(others: Motions, known: Motions) -> Array:
     return discrete_frechet(mean + left * (wanted[:, :1] - mean[0]), wanted)
 
 
-def _why_not(motions: Motions, plain: Callable[[ImitationSettings], Imitation]) -> str:
-    """Why a plain fit with the default settings does not do; empty where it draws the motions."""
-    settings = ImitationSettings()
+def _why_not(motions: Motions, plain: Callable[[ImitationSettings], Imitation], settings: ImitationSettings) -> str:
+    """Why a plain fit with these settings does not do; empty where it draws the motions."""
     try:
         off = motions.missed_by(plain(settings).system, motions.starts)
     except ImitationError as error:

@@ -18,6 +18,7 @@ from dt_viz.robot.models import load_jaco as load_robot
 from dt_viz.robot.retiming import within_velocity_limits
 from dt_viz.robot.robot import Robot
 from dt_viz.robot.tracking_settings import TrackingSettings
+from dt_viz.warning import in_millimetres
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +32,10 @@ class JointPath:
     error: Array
     """(T,) distances of the hand from the path, metres: what it misses, or gives way by."""
 
+    def __repr__(self) -> str:
+        off = in_millimetres(float(self.error.max()))
+        return f"JointPath({len(self.q)} samples of {self.q.shape[1]} joints, {self.times[-1]:.3g} s, hand {off} off)"
+
 
 class BlockedError(Exception):
     """The whole arm finds no motion around an obstacle."""
@@ -43,6 +48,10 @@ class Arm:
         """Wrap a robot; see `load_jaco`."""
         self.robot = robot
         self._follower = Follower(robot)
+
+    def __repr__(self) -> str:
+        first, *_, last = self.robot.joint_names
+        return f"Arm({len(self.robot.joint_names)} joints, {first} to {last})"
 
     def follow(self, path: Path) -> JointPath:
         """The joints along a path of the hand.
@@ -128,6 +137,9 @@ class Controller(ArmController):
         rollout = None if label is None else int(motion.labelled(label)[0])
         super().__init__(arm._follower, _live(motion), settings, rollout)
         self._motion = motion
+
+    def __repr__(self) -> str:
+        return f"Controller({self._motion!r})"
 
     @property
     def motion(self) -> Motion:

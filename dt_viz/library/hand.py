@@ -39,6 +39,10 @@ class HandController:
         self._top = float(self._rest[0]) if len(self._rest) else 0.0
         self._expected = motion.in_space(np.asarray(start, float)[None])[0]
 
+    def __repr__(self) -> str:
+        phase = f"phase {self.phase:.2f} of " if self._top else ""
+        return f"HandController({phase}{self._motion!r})"
+
     @property
     def phase(self) -> float:
         """Part of the motion that is left, from 1 to 0; 0 in the plain state, which has none."""

@@ -1,6 +1,6 @@
 """The library: from demonstrations to a stable motion, transforms stacked on it, its paths and its velocity field.
 
-    motion = dt.fit(dt.load_demonstrations("push_box.npz"))
+    motion = dt.fit(dt.example("push_box"))
     around = motion.stack(dt.Avoidance(dt.Sphere((0.10, -0.53, 0.15), diameter=0.15)))
     paths = around.rollouts(spacing=0.005)
 
@@ -10,6 +10,7 @@ Everything is computed by what the page is computed by; `import dt_viz` offers t
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -18,16 +19,20 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dt_viz.avoidance.registry import entry_of
-from dt_viz.avoidance.transform import Planar, Transform
+from dt_viz.avoidance.transform import Transform
 from dt_viz.errors import FormatError, check_between
 from dt_viz.flows.augmented_systems import frozen
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.rollouts import Rays, evenly_sampled, refined
 from dt_viz.learning.augmented import unknown_label
-from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.imitation import ImitationSettings, Objective
+from dt_viz.learning.inspection import Inspection
 from dt_viz.learning.patterns import AugmentedSettings
+from dt_viz.learning.preparation import DemonstrationWarning, prepare
 from dt_viz.learning.state import State, learn
+from dt_viz.library.places import as_place, in_space
+from dt_viz.library.report import many, missed, placed, sampled, summaries
+from dt_viz.library.takes import Demonstrations, demonstrations_of
 from dt_viz.motion.certificates import Certificates, DrawnSamples, certified
 from dt_viz.motion.diagnostics import motion_warnings
 from dt_viz.motion.nominal import NUM_SAMPLES, Learned, Nominal
@@ -39,8 +44,6 @@ from dt_viz.scenario.tasks import Task
 
 NUM_COORDINATES = 3
 """Coordinates of motions in space."""
-PLANE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
-"""The plane of motions with two coordinates."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,15 +55,46 @@ class Path:
     times: Array
     """(T,) seconds from the start."""
 
+    def __repr__(self) -> str:
+        return f"Path({sampled(self.positions, self.times)})"
+
 
 class Motion:
     """A stable motion: what was learned from demonstrations, and the transforms stacked on it. Not to be changed."""
 
-    def __init__(self, learned: Learned, layers: tuple[Layer, ...] = ()) -> None:
+    def __init__(
+        self, learned: Learned, layers: tuple[Layer, ...] = (), inspections: tuple[Inspection, ...] = ()
+    ) -> None:
         """Wrap what was learned; see `fit`."""
         self._learned, self._layers = learned, layers
+        self.inspections = inspections
+        """What was found about each demonstration that was given, and what was done about it."""
         self.dimension = len(learned.imitation.goal)
         """d: 2 of drawings, 3 of motions in space."""
+
+    def __repr__(self) -> str:
+        takes, where = (
+            many(len(self._learned.imitation.starts), "take"),
+            "the plane" if self.dimension == 2 else "space",
+        )
+        layers = "".join(f", {layer.name}" for layer in self._layers)
+        goal = placed(self._learned.goal[: self.dimension])
+        return f"Motion({takes} in {where}, {self.state} state, goal {goal}{layers})"
+
+    def report(self) -> str:
+        """What was learned from which takes: a line for each with what was found, what was done, and the error.
+
+        The error is the discrete Fréchet distance of the learned motion, without transforms, from the repaired take.
+        """
+        learned, lines = self._learned, [repr(self)]
+        if self.reason:
+            lines.append(f"{self.state} state: {self.reason}")
+        paths = [path[:, : self.dimension] for path in learned.demonstrated.paths]
+        for inspection, own, path in zip(self.inspections, learned.task.demonstrations, paths, strict=False):
+            off = f"; the learned motion is up to {missed(path, own.positions)} off" if inspection.kept else ""
+            lines.append(f"{inspection}{off}")
+        told = {text for inspection in self.inspections for text in inspection.warnings}
+        return "\n".join([*lines, *(text for text in learned.imitation.warnings if text not in told)])
 
     @property
     def transforms(self) -> tuple[Transform, ...]:
@@ -75,17 +109,20 @@ class Motion:
     def stack(self, *transforms: Transform) -> Motion:
         """The motion with more transforms on it, the last one outermost.
 
-        A motion in the plane stays there: what is stacked acts along the plane only. What the joints are to avoid
-        (`Avoidance(space="cspace")`) changes the motions of the arm (`Arm.rollouts`), not those of the hand.
+        A motion in the plane stays there: what is stacked acts along the plane only, and its places may be (x, y).
+        What the joints are to avoid (`Avoidance(space="cspace")`) changes the motions of the arm (`Arm.rollouts`), not
+        those of the hand.
+
+        Raises:
+            FormatError: a place has not as many coordinates as the motion, or one that is not finite.
         """
         scenario = self.scenario
         for transform in transforms:
-            planar = self.dimension == 2 and isinstance(transform, Planar)
-            flat = replace(transform, plane=PLANE) if planar else transform
-            names, title = {layer.name for layer in scenario.stack}, entry_of(flat).title
+            names, title = {layer.name for layer in scenario.stack}, entry_of(transform).title
             name = next(name for k in range(1, len(names) + 2) if (name := f"{title} {k}") not in names)
-            scenario = replace(scenario, stack=(*scenario.stack, Layer(flat, name=name)))
-        return Motion(self._learned, scenario.stack)
+            layer = Layer(in_space(transform, self.dimension), name=name)
+            scenario = replace(scenario, stack=(*scenario.stack, layer))
+        return Motion(self._learned, scenario.stack, self.inspections)
 
     def rollouts(
         self, starts: ArrayLike | None = None, *, spacing: float = 0.005, label: float | None = None
@@ -196,7 +233,13 @@ class Motion:
         imitation = learned.imitation
         augmented = imitation.state == "augmented"
         saved = SavedMotion(
-            learned.task.demonstrations, self._layers, augmented, imitation.labels, self.reason, imitation.augmented
+            learned.task.demonstrations,
+            self._layers,
+            augmented,
+            imitation.labels,
+            self.reason,
+            imitation.augmented,
+            self.inspections,
         )
         save_motion(path, saved, imitation)
 
@@ -211,7 +254,8 @@ class Motion:
                 whatever the file holds; nothing is unpickled.
         """
         saved, imitation = load_motion(path)
-        return cls(Learned.of(Task(demonstrations=saved.demonstrations), imitation, imitates=True), saved.layers)
+        learned = Learned.of(Task(demonstrations=saved.demonstrations), imitation, imitates=True)
+        return cls(learned, saved.layers, saved.inspections)
 
     @cached_property
     def solution(self) -> Solution:
@@ -264,17 +308,24 @@ class Motion:
 
 
 def fit(
-    demonstrations: Sequence[Demonstration],
+    demonstrations: Demonstrations,
     objective: Objective = "trajectory",
     state: State = "auto",
     labels: Sequence[float] | None = None,
     settings: ImitationSettings | None = None,
     augmented: AugmentedSettings | None = None,
+    *,
+    rate: float | None = None,
+    goal: Sequence[float] | None = None,
 ) -> Motion:
     """Learn a stable motion from demonstrations, all ending at (about) the same place.
 
+    What is odd about them is repaired, and said by a `DemonstrationWarning` for each kind; `Motion.report` lists all.
+
     Args:
-        demonstrations: of one motion, with 2 or 3 coordinates; see `load_demonstrations`.
+        demonstrations: of one motion, with d = 2 or 3 coordinates, metres: an array (T, d) or (N, T, d), or several of
+            these; pairs of times (T,) and positions (T, d); `Demonstration`s; a pandas.DataFrame with columns x, y and
+            perhaps z, t, demo; the path of a file or folder; or several of any of these, also by name.
         objective: what is fitted in the plain state: the motions, or their velocities as in eq. (3).
         state: "plain" is the paper's: one vector field of places, which needs no memory. "augmented" remembers its
             phase and where it began: it crosses itself, comes back, winds, and draws the figure from other starts,
@@ -282,12 +333,39 @@ def fit(
             extent and, with three or more, follows those that are left out about as well as the augmented state.
         labels: a number for each demonstration, where they differ although they begin at one place: those with one
             number are of one pattern; makes the state augmented. None finds them where that is so; see `Motion.labels`.
-        settings: of the plain fit, the objective included; None takes the defaults.
-        augmented: settings of the augmented state; None takes the defaults.
+        settings: of the plain fit, the objective included, and of the preparation; None takes the defaults.
+        augmented: settings of the augmented state; None takes the defaults, and that preparation.
+        rate: samples a second, Hz, of arrays and tables without times; None takes each take as 5 s long.
+        goal: (d,) where the motion is to end, metres; takes that end elsewhere are left out. None is where most end.
 
     Raises:
+        DataError: these are no demonstrations.
         ImitationError: no stable motion can be learned from them, or there is no such state.
     """
-    given = tuple(demonstrations)
-    imitation = learn(given, settings or ImitationSettings(objective), state, labels, augmented=augmented)
-    return Motion(Learned.of(Task(demonstrations=given), imitation, imitates=True))
+    given = demonstrations_of(demonstrations, rate)
+    settings = settings or ImitationSettings(objective)
+    augmented = augmented or AugmentedSettings(preparation=settings.preparation)
+    if goal is not None:
+        place = as_place(goal, given[0].dimension, "goal")
+        settings = replace(settings, preparation=replace(settings.preparation, goal=place))
+        augmented = replace(augmented, preparation=replace(augmented.preparation, goal=place))
+    motions = prepare(given, settings.preparation)
+    _check_goals(motions.inspections, labels)
+    for text in summaries(motions.inspections):
+        warnings.warn(text, DemonstrationWarning, stacklevel=2)
+    imitation = learn(motions.repaired, settings, state, labels, augmented=augmented)
+    learned = Learned.of(Task(demonstrations=motions.repaired), imitation, imitates=True)
+    return Motion(learned, inspections=motions.inspections)
+
+
+def _check_goals(inspections: Sequence[Inspection], labels: Sequence[float] | None) -> None:
+    """Raise FormatError where all takes with a label were left out: it has a goal of its own."""
+    if labels is None or len(labels) != len(inspections):
+        return
+    kept = dict.fromkeys(labels, False)
+    for inspection, label in zip(inspections, labels, strict=True):
+        kept[label] |= inspection.kept
+    if not all(kept.values()):
+        lost = next(label for label in kept if not kept[label])
+        accepted = "labels of motions to one goal; learn the takes to each goal by themselves, with goal=… if need be"
+        raise FormatError("labels", f"{lost!r} for takes that end elsewhere than the others", accepted)

@@ -60,6 +60,19 @@ class Certificates:
     found: tuple[MotionWarning, ...] = ()
     """All warnings, also those that only follow from others."""
 
+    def __repr__(self) -> str:
+        parts = ["nothing to avoid" if np.isinf(self.clearance) else f"clearance {1e3 * self.clearance:.1f} mm"]
+        if self.collision is not None:
+            parts.append(f"arm {1e3 * self.collision.obstacle.distance:.1f} mm from the obstacle")
+        if self.min_det_jacobian is not None:
+            parts.append(f"det J ≥ {self.min_det_jacobian:.2g}")
+        if self.round_trip_error is not None:
+            parts.append(f"round trip within {1e3 * self.round_trip_error:.1g} mm")
+        if self.lyapunov_falls is not None:
+            parts.append(f"Lyapunov value {'falls' if self.lyapunov_falls else 'does not fall'}")
+        texts = "; ".join(warning.text for warning in self.warnings)
+        return f"Certificates({', '.join(parts)}, {f'warnings: {texts}' if texts else 'no warnings'})"
+
     @property
     def warnings(self) -> tuple[MotionWarning, ...]:
         """Why the result is not to be trusted: what is to be told."""

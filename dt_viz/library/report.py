@@ -1,0 +1,44 @@
+"""Words about library values: one line for each, and the report on what was learned from demonstrations."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from dt_viz.flows.fields import Array
+from dt_viz.learning.inspection import Inspection
+from dt_viz.metrics import arc_length, discrete_frechet, resample_by_arc_length
+from dt_viz.warning import in_millimetres
+
+
+def placed(point: Iterable[float]) -> str:
+    """A place, such as "(0.1, -0.53, 0.15) m"."""
+    return f"({', '.join(f'{x + 0.0:.3g}' for x in np.round(list(point), 6))}) m"
+
+
+def many(num: int, what: str) -> str:
+    """A number of things, such as "1 take" or "2 takes"."""
+    return f"{num} {what}{'' if num == 1 else 's'}"
+
+
+def sampled(positions: Array, times: Array) -> str:
+    """Samples of a motion: their number, its length and duration."""
+    return f"{len(times)} samples, {arc_length(positions)[-1]:.3g} m in {times[-1]:.3g} s"
+
+
+def summaries(inspections: Sequence[Inspection]) -> list[str]:
+    """One sentence for each kind of finding and remedy, about its first take and the number of others."""
+    alike: dict[tuple[str, str], list[str]] = defaultdict(list)
+    for inspection in inspections:
+        for found, text in zip(inspection.findings, inspection.warnings, strict=True):
+            alike[found.kind, found.remedy].append(text)
+    more = "{} (and {} alike; see Motion.report())"
+    return [more.format(first, many(len(rest), "more take")) if rest else first for first, *rest in alike.values()]
+
+
+def missed(path: Array, demonstration: Array) -> str:
+    """Discrete Fréchet distance of a learned motion (T, d) from its demonstration (S, d)."""
+    off = discrete_frechet(resample_by_arc_length(path, 200), resample_by_arc_length(demonstration, 200))
+    return in_millimetres(float(off))
