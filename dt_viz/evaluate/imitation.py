@@ -38,9 +38,10 @@ from dt_viz.evaluate import figures
 from dt_viz.evaluate.figures import FigurePanel
 from dt_viz.evaluate.held_out import WAYS, Followed, Learn, begun, follow, frechet, rollouts_from
 from dt_viz.evaluate.options import InputError, ready_folder, report, whole_number, write_json, write_npz
+from dt_viz.files.archives import LASA_UNITS
 from dt_viz.flows.diffeomorphisms import min_det_jacobian, round_trip_error
 from dt_viz.flows.fields import Array
-from dt_viz.learning.demonstrations import METRES_PER_LASA_UNIT, Demonstration, load_demonstrations
+from dt_viz.learning.demonstrations import Demonstration, load_demonstrations
 from dt_viz.learning.imitation import OBJECTIVES, ImitationError, ImitationSettings, fit, grown_grid
 from dt_viz.learning.interface import AnyImitation
 from dt_viz.learning.state import learn as learn_in_state
@@ -258,7 +259,7 @@ def _sources(paths: Sequence[Path]) -> list[Source]:
         if path.stem in sources:
             found = f"{str(sources[path.stem].path)!r} and {str(path)!r}, which would both become {path.stem}.npz"
             raise InputError("SHAPE", found, "files of different names")
-        unit = METRES_PER_LASA_UNIT if path.suffix.lower() == ".mat" else 1.0
+        unit = LASA_UNITS["length"] if path.suffix.lower() == ".mat" else 1.0
         sources[path.stem] = Source(path, load_demonstrations(path), unit)
     return list(sources.values())
 
