@@ -77,22 +77,19 @@ def _check_matlab(file: BinaryIO) -> None:
 def _check_elements(data: memoryview, order: str) -> None:
     """Check the elements that follow each other in a MATLAB file of version 5, or in a part of it."""
     place = 0
-    while place + 8 <= len(data):
+    while place < len(data):
         kind, size = struct.unpack_from(f"{order}II", data, place)
-        is_small = kind >> 16 > 0  # its data stand in the place of its size
-        kind &= 0xFFFF
-        if not 1 <= kind <= 18:
-            raise FormatError("file", f"an element of the unknown type {kind}", "a whole MATLAB file")
-        if not is_small:
-            inner = data[place + 8 : place + 8 + size]
-            if kind == 15:  # compressed
-                unpacked = zlib.decompressobj().decompress(inner, LIMITS.bytes + 1)
-                check_size(len(unpacked), LIMITS.bytes)
-                _check_elements(memoryview(unpacked), order)
-            elif kind == 14:  # of other elements
-                _check_elements(inner, order)
-            place += size + (-size % 8 if kind != 15 else 0)
         place += 8
+        if not 1 <= kind & 0xFFFF <= 18 or (kind < 2**16 and size > len(data) - place):
+            raise FormatError("file", f"a broken element of type {kind & 0xFFFF}", "a whole MATLAB file")
+        if kind == 15:  # compressed
+            unpacked = zlib.decompressobj().decompress(data[place : place + size], LIMITS.bytes + 1)
+            check_size(len(unpacked), LIMITS.bytes)
+            _check_elements(memoryview(unpacked), order)
+        elif kind == 14:  # made of elements
+            _check_elements(data[place : place + size], order)
+        if kind < 2**16:  # the data of others stand in the place of their size
+            place += size + (-size % 8 if kind != 15 else 0)
 
 
 def read_json(file: BinaryIO, source: Path, _options: ReadOptions) -> Iterator[Table]:

@@ -281,16 +281,13 @@ class TestArrays:
 
     @pytest.mark.parametrize("nested", [False, True])
     def test_json_records(self, nested):
-        rows = zip(TIMES.tolist(), path_of().tolist(), strict=True)
-        records = [
-            {
-                "stamp": {"sec": 1700000000 + int(t), "nanosec": round(t % 1 * 1e9)},
-                "position": dict(zip("xyz", p, strict=True)),
-            }
-            if nested
-            else {"t": t, "position": [x, y, z]}
-            for t, x, y, z in rows
-        ]
+        def record(t, x, y, z):
+            if not nested:
+                return {"t": t, "position": [x, y, z]}
+            stamp = {"sec": 1700000000 + int(t), "nanosec": round(t % 1 * 1e9)}
+            return {"stamp": stamp, "pose": {"position": {"x": x, "y": y, "z": z}}}
+
+        records = [record(*row) for row in np.column_stack([TIMES, path_of()]).tolist()]
         (read,) = read_demonstrations(json.dumps(records).encode(), "a.json")
         np.testing.assert_allclose(read.positions, path_of())
         np.testing.assert_allclose(read.times, TIMES, atol=1e-6)
