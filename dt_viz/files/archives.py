@@ -99,27 +99,24 @@ def read_json(file: BinaryIO, source: Path, _options: ReadOptions) -> Iterator[T
     yield from tables_of(json.loads(content), source.stem)
 
 
-def read_parquet(file: BinaryIO, source: Path, options: ReadOptions) -> Iterator[Table]:
+def read_parquet(content: BinaryIO, source: Path, options: ReadOptions) -> Iterator[Table]:
     """Read a table, such as LeRobot's: ``observation.state``, ``timestamp``, ``episode_index``."""
-    parquet = imported("pyarrow.parquet", "parquet").ParquetFile(file, pre_buffer=False)
+    file = imported("pyarrow.parquet", "parquet").ParquetFile(content, pre_buffer=False)
     given = {name.lower() for name in options.roles.values()}
-    names = parquet.schema_arrow.names
-    num = parquet.metadata.num_rows
-    columns: dict[str, np.ndarray] = {}
-    for name in names:
-        kind = str(parquet.schema_arrow.field(name).type)
-        if role_of(name) is None and name.lower() not in given and "list" not in kind:
-            continue
-        check_at_most("file", (len(columns) + 1) * num, LIMITS.numbers, "numbers")
-        column = parquet.read(columns=[name]).column(0).combine_chunks()
-        if "list" in kind:
-            values = column.flatten().to_numpy(zero_copy_only=False)
-            if values.dtype.kind in "iuf" and num and len(values) % num == 0:
-                columns[name] = values.reshape(num, -1)
-        else:
-            columns[name] = column.to_numpy(zero_copy_only=False)
-    unused = tuple(name for name in names if name not in columns)
-    yield Table(source.stem, columns, unused=unused)
+    kinds = {field.name: str(field.type) for field in file.schema_arrow}
+    names = [name for name in kinds if role_of(name) or name.lower() in given or "list" in kinds[name]]
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in names}
+    size = 0
+    for batch in file.iter_batches(2**16, columns=names):
+        for name, column in zip(names, batch.columns, strict=True):
+            values = (column.flatten() if "list" in kinds[name] else column).to_numpy(zero_copy_only=False)
+            size += values.size
+            check_at_most("file", size, LIMITS.numbers, "numbers")
+            whole = len(values) % len(column) == 0 and values.dtype.kind in "iuf"
+            parts[name].append(values.reshape(len(column), -1) if "list" in kinds[name] and whole else values.copy())
+    columns = {name: np.concatenate(parts.pop(name)) for name in names if parts[name]}
+    imported("pyarrow", "parquet").default_memory_pool().release_unused()
+    yield Table(source.stem, columns, unused=tuple(name for name in kinds if name not in columns))
 
 
 def read_hdf5(file: BinaryIO, source: Path, _options: ReadOptions) -> Iterator[Table]:

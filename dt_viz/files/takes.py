@@ -118,7 +118,7 @@ def _split(table: Table, options: ReadOptions, notes: dict[str, None]) -> Iterat
     """Takes of a table, in its own units, and the sizes of these units as far as they are known."""
     columns = _named_columns(table, options)
     found = layout([*columns], table.unused)
-    if others := [name for name in (*columns, *table.unused) if name not in found.used]:
+    if others := [name for name in (*columns, *table.unused) if name not in {*found.used, "name"}]:
         notes[f"columns {', '.join(others)[:200]} are not used"] = None
     units = _units_of(found) | table.units
     names = found.positions or found.joints
