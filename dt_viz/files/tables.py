@@ -7,6 +7,7 @@ import importlib
 import io
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -140,9 +141,12 @@ def read_text(file: BinaryIO, source: Path, options: ReadOptions) -> Iterator[Ta
     if len(rows) > max_rows:
         raise too_many("file", max_rows, "lines")
 
+    path = getattr(file, "name", None)
+
     def place(row: int) -> str:
-        data = itertools.islice(_rows(file, skipped, delimiter), row, None)
-        return f"at line {next(data)[0]}"
+        with Path(path).open("rb") if path else nullcontext(file) as again:
+            number, _ = next(itertools.islice(_rows(again, skipped, delimiter), row, None))
+        return f"at line {number}"
 
     if not names:
         matrix = np.stack([rows[f"f{k}"] for k in used], axis=1)

@@ -29,7 +29,7 @@ USUAL_RATE = 100.0
 
 @dataclass(frozen=True, eq=False)
 class Take:
-    """One recorded motion of the hand, or of an arm's joints, before it is checked."""
+    """One recorded motion of the hand, or of an arm's joints, before it is checked; its units may be others."""
 
     name: str
     times: np.ndarray
@@ -43,6 +43,8 @@ class Take:
     joint_names: tuple[str, ...]
     place: Callable[[int], str]
     """Describes the place of a sample in the file, for messages."""
+    units: Mapping[str, float]
+    """Sizes of the units of "length", "time" and "angle", as far as the file says."""
 
 
 Rows = slice | np.ndarray
@@ -69,7 +71,7 @@ READERS: Mapping[str, tuple[Reader, str]] = {
 
 
 def read_takes(content: bytes | BinaryIO, source: Path, options: ReadOptions) -> tuple[list[Take], tuple[str, ...]]:
-    """Read the takes of a file.
+    """Read the takes of a file, in its units; `in_si_units` changes these over all files.
 
     Args:
         content: all bytes of the file, or the file.
@@ -94,15 +96,15 @@ def takes_of(tables: Iterable[Table], options: ReadOptions) -> tuple[list[Take],
     if options.rate is not None and not 0 < options.rate < np.inf:
         raise FormatError("rate", f"{options.rate:g}", "samples per second, above 0")
     given = _given_units(options.unit)
-    parts: list[tuple[Take, dict[str, float]]] = []
+    takes: list[Take] = []
     notes: dict[str, None] = {}
     total = 0
     for table in tables:
-        for take, units in _split(table, options, notes):
-            parts.append((take, units | given))
+        for take in _split(table, options, notes):
+            takes.append(replace(take, units=take.units | given))
             total += len(take.times) * (8 if take.orientations is not None else 4)
             check_at_most("takes", total, LIMITS.numbers, "numbers")
-    return _in_si_units(parts, notes), tuple(notes)
+    return takes, tuple(notes)
 
 
 def _given_units(text: str | None) -> dict[str, float]:
@@ -114,8 +116,8 @@ def _given_units(text: str | None) -> dict[str, float]:
     return units
 
 
-def _split(table: Table, options: ReadOptions, notes: dict[str, None]) -> Iterator[tuple[Take, dict[str, float]]]:
-    """Takes of a table, in its own units, and the sizes of these units as far as they are known."""
+def _split(table: Table, options: ReadOptions, notes: dict[str, None]) -> Iterator[Take]:
+    """Takes of a table, in its own units."""
     columns = _named_columns(table, options)
     found = layout([*columns], table.unused)
     if others := [name for name in (*columns, *table.unused) if name not in {*found.used, "name"}]:
@@ -123,7 +125,7 @@ def _split(table: Table, options: ReadOptions, notes: dict[str, None]) -> Iterat
     units = _units_of(found) | table.units
     names = found.positions or found.joints
     length = len(columns[names[0]])
-    times = _times(columns, found, options, units)
+    times = _times(columns, found, options)
     groups = [("", slice(0, length))]
     if found.label and columns[found.label].shape == (length,):
         groups = _labelled(columns[found.label], table.labels)
@@ -140,10 +142,10 @@ def _split(table: Table, options: ReadOptions, notes: dict[str, None]) -> Iterat
         seconds = seconds[rows] if len(seconds) == length else seconds
         place = _placing(table.place, rows)
         if found.positions:
-            yield Take(name, seconds, values, turns, None, (), place), units
+            yield Take(name, seconds, values, turns, None, (), place, units)
         else:
             joint_names = tuple(joint.removeprefix("joint.") for joint in found.joints)
-            yield Take(name, seconds, None, None, values, joint_names, place), units
+            yield Take(name, seconds, None, None, values, joint_names, place, units)
 
 
 def _named_columns(table: Table, options: ReadOptions) -> dict[str, np.ndarray]:
@@ -182,9 +184,7 @@ def _units_of(found: Layout) -> dict[str, float]:
     return dict(UNITS[unit] for unit in named if unit)
 
 
-def _times(
-    columns: Mapping[str, np.ndarray], found: Layout, options: ReadOptions, units: dict[str, float]
-) -> np.ndarray | None:
+def _times(columns: Mapping[str, np.ndarray], found: Layout, options: ReadOptions) -> np.ndarray | None:
     """Times of a table in its unit, None if it has none."""
     if not found.time:
         return None
@@ -251,15 +251,20 @@ def _unit_quaternions(turns: np.ndarray) -> np.ndarray | None:
     return turns
 
 
-def _in_si_units(parts: Sequence[tuple[Take, dict[str, float]]], notes: dict[str, None]) -> list[Take]:
-    """Takes in metres, seconds and radians: from units that are known, or recognised over all takes of the file."""
+def in_si_units(takes: Sequence[Take]) -> tuple[list[Take], str]:
+    """Bring takes of one or several files into metres, seconds and radians.
+
+    Units that the files do not say are recognised over all takes: coordinates beyond any arm's reach, steps in time
+    that no recorder has, and angles of more than two turns are in smaller units.
+
+    Returns:
+        The takes, whose places or angles may have been changed in place, and a note if units were recognised.
+    """
     recognised = {}
-    lengths = [take.positions for take, units in parts if take.positions is not None and "length" not in units]
-    angles = [take.joints for take, units in parts if take.joints is not None and "angle" not in units]
-    times = [take.times for take, units in parts if len(take.times) > 1 and "time" not in units]
-    largest, widest = (
-        max((max(-v.min(), v.max()) for v in values if v.size), default=0.0) for values in (lengths, angles)
-    )
+    lengths = [take.positions for take in takes if take.positions is not None and "length" not in take.units]
+    angles = [take.joints for take in takes if take.joints is not None and "angle" not in take.units]
+    times = [take.times for take in takes if len(take.times) > 1 and "time" not in take.units]
+    largest, widest = _largest(lengths), _largest(angles)
     if largest > MAX_REACH:
         recognised["length"] = "mm" if largest > 10 * MAX_REACH else "cm"
     if widest > MAX_TURN:
@@ -268,18 +273,20 @@ def _in_si_units(parts: Sequence[tuple[Take, dict[str, float]]], notes: dict[str
     if step > SLOW and max(t[-1] - t[0] for t in times) > MAX_DURATION:
         ratios = {unit: UNITS[unit][1] * step * USUAL_RATE for unit in ("ms", "us", "ns")}
         recognised["time"] = min(ratios, key=lambda unit: abs(np.log(ratios[unit])))
-    if recognised:
-        notes[f"taken as in {' and '.join(recognised.values())} by its size; unit=… says otherwise"] = None
     guessed = {kind: UNITS[unit][1] for kind, unit in recognised.items()}
-    return [_scaled(take, guessed | units) for take, units in parts]
+    note = f"taken as in {' and '.join(recognised.values())} by its size; unit=… says otherwise" if recognised else ""
+    return [_scaled(take, guessed | take.units) for take in takes], note
+
+
+def _largest(arrays: Sequence[np.ndarray]) -> float:
+    return max((float(max(-array.min(), array.max())) for array in arrays if array.size), default=0.0)
 
 
 def _scaled(take: Take, units: Mapping[str, float]) -> Take:
-    """A take in metres, seconds and radians, from units of these sizes; its places are scaled in place."""
     if take.positions is not None and units.get("length", 1.0) != 1.0:
         np.multiply(take.positions, units["length"], out=take.positions)
     if take.joints is not None and units.get("angle", 1.0) != 1.0:
         np.multiply(take.joints, units["angle"], out=take.joints)
-    if units.get("time", 1.0) != 1.0:
-        return replace(take, times=(take.times - take.times[:1]) * units["time"])
-    return take
+    size = units.get("time", 1.0)
+    times = take.times if size == 1.0 else (take.times - take.times[:1]) * size
+    return replace(take, times=times, units={"length": 1.0, "time": 1.0, "angle": 1.0})

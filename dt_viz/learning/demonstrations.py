@@ -18,7 +18,7 @@ from dt_viz.errors import DataError, FormatError, naming, parsing
 from dt_viz.files.checks import check_at_most, check_finite, real_numbers
 from dt_viz.files.folders import bag_folder, files_of, is_bag, is_lerobot, lerobot_folder
 from dt_viz.files.tables import ReadOptions, at_sample
-from dt_viz.files.takes import READERS, Take, read_takes
+from dt_viz.files.takes import READERS, Take, in_si_units, read_takes
 
 logger = logging.getLogger(__name__)
 
@@ -30,6 +30,8 @@ MAX_COORDINATE, MAX_DURATION = 100.0, 3600.0
 """Largest coordinate (m) and duration (s); numbers beyond them are in another unit."""
 MIN_EXTENT = 1e-6
 """Smallest extent of a motion, metres; a smaller one is a point."""
+Found = tuple[Path, Sequence[Take], Sequence[str]]
+"""A file, its takes, and notes about them."""
 Places = Sequence[Callable[[int], str]]
 """For each demonstration, what describes the place of a sample in its file."""
 
@@ -220,21 +222,10 @@ def load_demonstrations(
             package that is not installed, has columns that are not clear, or holds demonstrations that
             :func:`check_demonstrations` refuses; or there are times beside a rate, or joint angles without an arm.
     """
-    robot = getattr(arm, "robot", arm)
-    options = ReadOptions(rate, unit, columns, topic, None if robot is None else len(robot.joint_names))
-    sources = [path] if isinstance(path, str | Path) else list(path)
-    demonstrations: list[Demonstration] = []
-    for source in map(Path, sources):
-        demonstrations += _load(source, options, robot)
-    with naming(DemonstrationError, ", ".join(map(str, sources))[:200]):
-        check_at_most("demonstrations", len(demonstrations), MAX_DEMONSTRATIONS)
-        if not demonstrations:
-            raise FormatError("files", "none", "a file or folder, or several")
-        first = demonstrations[0]
-        if others := [d for d in demonstrations if d.dimension != first.dimension]:
-            found = f"{first.dimension} in {first.name!r} but {others[0].dimension} in {others[0].name!r}"
-            raise FormatError("dimension", found, "one dimension for all")
-    return tuple(demonstrations)
+    options = ReadOptions(rate, unit, columns, topic, _num_joints(arm))
+    sources = [Path(path)] if isinstance(path, str | Path) else [*map(Path, path)]
+    found = [read for source in sources for read in _found_in(source, options)]
+    return demonstrations_of(found, ", ".join(map(str, sources))[:200], arm)
 
 
 def read_demonstrations(
@@ -258,67 +249,96 @@ def read_demonstrations(
         topic: see there.
         arm: see there.
     """
-    robot = getattr(arm, "robot", arm)
-    options = ReadOptions(rate, unit, columns, topic, None if robot is None else len(robot.joint_names))
-    return _read(io.BytesIO(content), Path(source), options, robot)
+    options = ReadOptions(rate, unit, columns, topic, _num_joints(arm))
+    return demonstrations_of([_read(io.BytesIO(content), Path(source), options)], source, arm)
 
 
-def _load(path: Path, options: ReadOptions, robot: Kinematics | None) -> tuple[Demonstration, ...]:
-    """Read a file or a folder."""
+def demonstrations_of(
+    found: Sequence[Found], source: str | Path, arm: Kinematics | None = None
+) -> tuple[Demonstration, ...]:
+    """Make demonstrations of the takes of one or several files; log lines say what was recognised or is not used.
+
+    Args:
+        found: for each file its path, its takes and notes about them, as `read_takes` gives them.
+        source: the files or the folder, for messages.
+        arm: as for :func:`load_demonstrations`.
+
+    Raises:
+        DemonstrationError: as :func:`load_demonstrations`.
+    """
+    said: dict[str, list[Path]] = {}
+    for path, _, notes in found:
+        for note in notes:
+            said.setdefault(note, []).append(path)
+    for note, paths in said.items():
+        logger.warning("%s%s: %s", paths[0], f" and {len(paths) - 1} more" * (len(paths) > 1), note)
+    with parsing(DemonstrationError, source, "takes", "recorded motions"):
+        takes, note = in_si_units([take for _, some, _ in found for take in some])
+        if note:
+            logger.warning("%s: %s", source, note)
+        check_at_most("demonstrations", len(takes), MAX_DEMONSTRATIONS)
+        kinds = {take.positions is None: take.name for take in takes}
+        if len(kinds) > 1:
+            what = f"joint angles in {kinds[True]!r} but places of the hand in {kinds[False]!r}"
+            raise FormatError("columns", what, "one kind for all")
+    demonstrations: list[Demonstration] = []
+    for path, some, _ in found:
+        mine, takes = takes[: len(some)], takes[len(some) :]
+        with parsing(DemonstrationError, path, "takes", "recorded motions"):
+            given = [Demonstration(take.times, _hand(take, arm), take.name, take.orientations) for take in mine]
+        demonstrations += check_demonstrations(given, path, [take.place for take in mine])
+    with naming(DemonstrationError, source):
+        if not demonstrations:
+            raise FormatError("demonstrations", "none", "at least one")
+        first = demonstrations[0]
+        if others := [d for d in demonstrations if d.dimension != first.dimension]:
+            what = f"{first.dimension} in {first.name!r} but {others[0].dimension} in {others[0].name!r}"
+            raise FormatError("dimension", what, "one dimension for all")
+    return tuple(demonstrations)
+
+
+def _found_in(path: Path, options: ReadOptions) -> list[Found]:
+    """Read a file, or the files of a folder."""
     with parsing(DemonstrationError, path, "path", "a readable file or folder"):
-        if path.is_dir():
-            if is_bag(path):
-                return _of_takes(*bag_folder(path, options), path, robot)
-            if is_lerobot(path):
-                return _of_takes(*lerobot_folder(path, options), path, robot)
-            files = files_of(path)
-            if not files:
-                raise FormatError("folder", "no file of recorded motions", f"files of the kinds {', '.join(READERS)}")
-            return tuple(d for file in files for d in _load(file, options, robot))
-        if not path.is_file():
-            raise FormatError("path", "no such file or folder", "a readable file or folder")
-        with path.open("rb") as file:
-            return _read(file, path, options, robot)
+        if not path.is_dir():
+            if not path.is_file():
+                raise FormatError("path", "no such file or folder", "a readable file or folder")
+            with path.open("rb") as file:
+                return [_read(file, path, options)]
+        if is_bag(path):
+            return [(path, *bag_folder(path, options))]
+        if is_lerobot(path):
+            return [(path, *lerobot_folder(path, options))]
+        if not (files := files_of(path)):
+            raise FormatError("folder", "no file of recorded motions", f"files of the kinds {', '.join(READERS)}")
+    return [read for file in files for read in _found_in(file, options)]
 
 
-def _read(file: BinaryIO, source: Path, options: ReadOptions, robot: Kinematics | None) -> tuple[Demonstration, ...]:
-    """Read a file, as long as it is open."""
+def _read(file: BinaryIO, source: Path, options: ReadOptions) -> Found:
     accepted = READERS.get(source.suffix.lower(), (None, "a file of recorded motions"))[1]
     with parsing(DemonstrationError, source, "file", accepted):
-        return _of_takes(*read_takes(file, source, options), source, robot)
+        return (source, *read_takes(file, source, options))
 
 
-def _of_takes(
-    takes: Sequence[Take], notes: Sequence[str], source: Path, robot: Kinematics | None
-) -> tuple[Demonstration, ...]:
-    """Say what was recognised, turn joint angles into places of the hand, and check all."""
-    for note in notes:
-        logger.warning("%s: %s", source, note)
-    kinds = {take.positions is None: take for take in takes}
-    if len(kinds) > 1:
-        found = f"joint angles in {kinds[True].name!r} but places of the hand in {kinds[False].name!r}"
-        raise DemonstrationError(source, "columns", found, "either in all")
-    with naming(DemonstrationError, source):
-        demonstrations = [
-            Demonstration(
-                take.times,
-                take.positions if take.positions is not None else _hand(take, robot),
-                take.name,
-                take.orientations,
-            )
-            for take in takes
-        ]
-    return check_demonstrations(demonstrations, source, [take.place for take in takes])
+def _num_joints(arm: Kinematics | None) -> int | None:
+    return None if arm is None else len(_kinematics(arm).joint_names)
 
 
-def _hand(take: Take, robot: Kinematics | None) -> np.ndarray:
-    """Positions (T, 3) of the hand, metres, by an arm's kinematics."""
+def _kinematics(arm: Kinematics) -> Kinematics:
+    """The arm itself, or the robot of a `dt.Arm`."""
+    return getattr(arm, "robot", arm)
+
+
+def _hand(take: Take, arm: Kinematics | None) -> np.ndarray:
+    """Positions (T, d) of the hand, metres, perhaps by an arm's kinematics."""
     q, names = take.joints, take.joint_names
-    assert q is not None
+    if take.positions is not None or q is None:
+        return np.empty((0, 3)) if take.positions is None else take.positions
     found = f"angles of {q.shape[1]} joints ({', '.join(names)[:160]})"
-    if robot is None:
+    if arm is None:
         accepted = "places of the hand, x, y and perhaps z; or name the arm that turns angles into such: arm=…"
         raise FormatError(f"columns of {take.name!r}", found, accepted)
+    robot = _kinematics(arm)
     wanted = list(robot.joint_names)
     check_finite(q, f"joints of {take.name!r}", take.place)
     if set(wanted) <= set(names):

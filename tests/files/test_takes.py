@@ -368,10 +368,10 @@ class TestJoints:
     def test_other_numbers_of_joints_and_two_kinds_in_one_folder_are_refused(self, tmp_path):
         (tmp_path / "a.csv").write_bytes(table(["t", "x", "y", "z"], [TIMES, *path_of().T]))
         (tmp_path / "b.csv").write_bytes(table(["t", *(f"q{k}" for k in range(5))], [TIMES, *RNG.normal(size=(5, 60))]))
-        with pytest.raises(DemonstrationError, match=r"b\.csv.*angles of 5 joints.*arm=…"):
+        with pytest.raises(DemonstrationError, match=r"joint angles in 'b' but places of the hand in 'a'"):
             load_demonstrations(tmp_path)
-        with pytest.raises(DemonstrationError, match=r"angles of 5 joints.*the arm's 2 \(shoulder, elbow\)"):
-            load_demonstrations(tmp_path, arm=Planar())
+        with pytest.raises(DemonstrationError, match=r"b\.csv.*angles of 5 joints.*the arm's 2 \(shoulder, elbow\)"):
+            load_demonstrations(tmp_path / "b.csv", arm=Planar())
 
 
 def lerobot(folder, names):
@@ -564,6 +564,18 @@ class TestFolders:
         assert len(load_demonstrations([tmp_path / "a.csv", str(tmp_path)])) == 4
         with pytest.raises(DemonstrationError, match="found none"):
             load_demonstrations([])
+
+    def test_units_are_recognised_over_all_files_and_said_once(self, tmp_path, caplog):
+        for k, size in enumerate((1, 10, 20)):  # the first alone might be metres
+            (tmp_path / f"{k}.csv").write_bytes(
+                table(["t", "x", "y", "z", "n"], [TIMES, *(10 * size * path_of()).T, TIMES])
+            )
+        read = load_demonstrations(tmp_path)
+        assert_same(read[0], 0.01 * path_of())
+        assert caplog.messages == [
+            f"{tmp_path / '0.csv'} and 2 more: columns n are not used",
+            f"{tmp_path}: taken as in mm by its size; unit=… says otherwise",
+        ]
 
 
 @pytest.mark.parametrize(
