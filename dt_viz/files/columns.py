@@ -46,6 +46,7 @@ ORIENTATIONS = {
     "orientations",
     "rot",
     "rotation",
+    "rotations",
 }
 HAND = {
     *("field", "pose", "poses", "point", "transform", "msg", "data", "obs", "observation", "state", "robot", "robot0"),
@@ -53,6 +54,8 @@ HAND = {
     *("tool", "tool0", "hand", "gripper", "flange", "wrist", "tip"),
 }
 """Words that tell the hand's place from nothing else in a file."""
+TOOL = {"cartesian", "tcp", "ee", "eef", "effector", "tool"}
+"""Words of which the first three numbered columns are places: ``actual_TCP_pose_0``."""
 WANTED = {"action", "actions", "cmd", "command", "target", "desired", "goal", "ref", "reference", "setpoint", "object"}
 """Words of places that the hand has not been at."""
 WANTED_RANK = 4
@@ -63,6 +66,8 @@ OTHERS = {
     *("covariance", "std", "error", "sin", "cos", "next", "reward", "rewards", "normal", "scale", "size"),
 }
 """Words of quantities that are not used."""
+ANGLES = {"q", "j", "joint", "theta", "angle", "axis", "pos", "position", "positions"}
+"""Words of joint angles before a number."""
 JOINTS = {"joint", "joints", "qpos", "angles", "servo", "motor"}
 MAX_TURN = 4 * np.pi
 """Largest joint angle, rad; numbers beyond it are degrees."""
@@ -114,29 +119,30 @@ def role_of(name: str) -> Role | None:
 
 
 def _place(words: list[str], unit: str) -> Role | None:
-    """Role of a column that is no time."""
-    axes = [k for k, word in enumerate(words) if word in ("x", "y", "z", "w")]
-    group = tuple(word for word in words if word not in ("x", "y", "z", "w"))
+    """Role of a column of places, orientations or joint angles."""
+    axes = [word for word in words if word in ("x", "y", "z", "w")]
+    group = tuple(word for word in words if word not in axes)
     among = set(group)
-    if len(axes) == 1 and among & ORIENTATIONS and not among & (OTHERS | WANTED):
-        return Role("orientation", group, words[axes[0]], unit=unit)
-    if among & OTHERS or group in [("v",), ("a",), ("f",), ("r",)] or (among & ORIENTATIONS and axes):
+    if among & OTHERS or group in [("v",), ("a",), ("f",), ("r",)] or len(axes) > 1:
         return None
-    if not axes and not among & (WANTED | {"gripper", "finger", "fingers"}):
-        numbered = [re.fullmatch(r"(?:q|j|joint|pos|position|theta|angle|axis)?(\d+)", word) for word in words]
-        if among & JOINTS or (words and numbered[-1] and len(words[-1]) > 1 and not words[-1].isdecimal()):
-            return Role("joint", unit=unit)
-        if len(words) > 1 and words[-1].isdecimal() and words[-2] in {"q", "j", "theta", "angle", "axis", *POSITIONS}:
-            return Role("joint", unit=unit)
-    if len(axes) != 1 or words[axes[0]] == "w":
-        return None
-    if among & WANTED:
-        rank = WANTED_RANK
-    elif among <= HAND | POSITIONS:
-        rank = 1 if among else 0
-    else:
-        rank = 2 if among & POSITIONS else 3
-    return Role("position", group, words[axes[0]], rank, unit)
+    if axes and among & ORIENTATIONS:
+        return None if among & WANTED else Role("orientation", group, axes[0], unit=unit)
+    if not axes and words[-1:] in (["0"], ["1"], ["2"]) and words[-2] in POSITIONS | {"pose"} and among & TOOL:
+        axes, group = ["xyz"[int(words[-1])]], group[:-1]
+    if axes and axes[0] != "w":
+        within = among <= HAND | POSITIONS | {"0", "1", "2"}
+        rank = WANTED_RANK if among & WANTED else int(bool(among)) if within else 2 if among & POSITIONS else 3
+        return Role("position", group, axes[0], rank, unit)
+    return Role("joint", unit=unit) if not axes and _is_joint(words) else None
+
+
+def _is_joint(words: list[str]) -> bool:
+    """Tell whether these words are a joint angle's: ``shoulder_pan_joint``, ``q1``, ``actual_q_0``, ``position0``."""
+    if not words or set(words) & (WANTED | {"gripper", "finger", "fingers"}):
+        return False
+    numbered = words[-1].isdecimal() and words[:-1] and words[-2] in ANGLES
+    fused = re.fullmatch(r"([a-z]+)\d+", words[-1])
+    return bool(set(words) & JOINTS or numbered or (fused and fused[1] in ANGLES))
 
 
 def _words(name: str) -> list[str]:
@@ -150,10 +156,10 @@ def _words(name: str) -> list[str]:
     return words
 
 
-def is_time(name: str) -> bool:
-    """Tell whether this is the name of times."""
+def is_kind(name: str, kind: str) -> bool:
+    """Tell whether this is the name of a column of some kind; see `Role`."""
     role = role_of(name)
-    return role is not None and role.kind == "time"
+    return role is not None and role.kind == kind
 
 
 def is_place(name: str) -> bool:

@@ -14,7 +14,7 @@ from dt_viz.errors import FormatError
 from dt_viz.files.archives import read_hdf5, read_json, read_mat, read_npy, read_npz, read_parquet
 from dt_viz.files.bags import read_bag
 from dt_viz.files.checks import check_at_most, checked_suffix, real_numbers
-from dt_viz.files.columns import MAX_TURN, UNITS, Layout, expanded, is_time, layout, role_of, unit_of, unnamed
+from dt_viz.files.columns import MAX_TURN, UNITS, Layout, expanded, is_kind, layout, role_of, unit_of, unnamed
 from dt_viz.files.tables import LIMITS, ReadOptions, Table, read_text
 
 UNTIMED = 5.0
@@ -120,7 +120,7 @@ def _split(table: Table, options: ReadOptions, notes: dict[str, None]) -> Iterat
     """Takes of a table, in its own units."""
     columns = _named_columns(table, options)
     found = layout([*columns], table.unused)
-    if others := [name for name in (*columns, *table.unused) if name not in {*found.used, "name"}]:
+    if others := [name for name in (*columns, *table.unused) if name not in {*found.used, "name", ""}]:
         notes[f"columns {', '.join(others)[:200]} are not used"] = None
     units = _units_of(found) | table.units
     names = found.positions or found.joints
@@ -155,7 +155,7 @@ def _named_columns(table: Table, options: ReadOptions) -> dict[str, np.ndarray]:
         if name:
             columns |= expanded(name, values)
             continue
-        rated = options.rate is not None or any(map(is_time, table.columns))
+        rated = options.rate is not None or any(is_kind(other, "time") for other in table.columns)
         names = options.names or unnamed(values, options.num_joints, rated=rated, timed=False)
         if len(names) != values.shape[1]:
             raise FormatError("columns", f"{len(names)} names for {values.shape[1]} columns", "a name for each")

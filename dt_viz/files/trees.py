@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from dt_viz.errors import FormatError
-from dt_viz.files.columns import expanded, is_place, is_time, layout, role_of
+from dt_viz.files.columns import expanded, is_kind, is_place, layout
 from dt_viz.files.tables import Table
 
 ACCEPTED = "times (T,) and positions (T, d), d 2 or 3, of one take or of each; or arrays (T, d) or (N, T, d)"
@@ -33,8 +34,9 @@ def tables_of(tree: Any, name: str) -> Iterator[Table]:  # noqa: ANN401 - whatev
         found = True
         yield table
     if not found:
-        names = ", ".join(map(repr, tree)) if isinstance(tree, Mapping) else type(tree).__name__
-        raise FormatError("arrays", f"no takes in {names[:160] or 'an empty file'}", ACCEPTED)
+        what = f"an array {tree.shape} of {tree.dtype}" if isinstance(tree, np.ndarray) else f"a {type(tree).__name__}"
+        names = ", ".join(map(repr, tree)) or "an empty file" if isinstance(tree, Mapping) else what
+        raise FormatError("arrays", f"no takes in {names[:160]}", ACCEPTED)
 
 
 def condensed(tree: Any) -> Any:  # noqa: ANN401 - whatever a file holds
@@ -75,8 +77,8 @@ def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, np.ndarray]:
 def _is_sample(record: Mapping[str, np.ndarray]) -> bool:
     """Tell whether this is a sample, whose parts are numbers and short vectors, rather than a take."""
     numbers = [key for key, value in record.items() if value.ndim == 0 and value.dtype.kind in "iuf"]
-    rates = [key for key in numbers if (role := role_of(key)) and role.kind == "rate"]
-    return len(numbers) > len(rates) and all(value.ndim == 0 or value.shape < (17,) for value in record.values())
+    others = [key for key in numbers if not is_kind(key, "rate")]
+    return bool(others) and all(value.ndim < 2 and value.size < 17 for value in record.values())
 
 
 def _columns(records: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
@@ -106,8 +108,10 @@ def _of_mapping(tree: Mapping[str, Any], name: str) -> Iterator[Table]:
         yield from _several(arrays, name)
     else:
         parts = {key: value for key, value in tree.items() if key not in own or (own[key].ndim > 1 and is_place(key))}
+        rates = {key: value for key, value in own.items() if not value.ndim and is_kind(key, "rate")}
         for key, value in parts.items():
-            yield from _tables(value, name if len(parts) == 1 else key)
+            for table in _tables(value, name if len(parts) == 1 else key):
+                yield replace(table, columns={**rates, **table.columns})
 
 
 def _numbered(arrays: Mapping[str, np.ndarray]) -> dict[int, dict[str, np.ndarray]]:
@@ -124,8 +128,9 @@ def _numbered(arrays: Mapping[str, np.ndarray]) -> dict[int, dict[str, np.ndarra
 
 
 def _all_upright(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    times = [value.size for key, value in arrays.items() if is_time(key)]
-    return {key: _upright(value, times[0] if times else None) for key, value in arrays.items()}
+    times = {key: value for key, value in arrays.items() if is_kind(key, "time")}
+    length = next((max(value.shape, default=0) for value in times.values()), None)
+    return {key: value if key in times else _upright(value, length) for key, value in arrays.items()}
 
 
 def _upright(array: np.ndarray, length: int | None) -> np.ndarray:
@@ -150,7 +155,7 @@ def _several(arrays: Mapping[str, np.ndarray], name: str) -> Iterator[Table]:
     """Return a table, or one for each index of the first axis of arrays (N, T, k)."""
     given = arrays.get("name")
     name = str(given) if given is not None and given.ndim == 0 and given.dtype.kind == "U" else name
-    deep = next((value.shape for value in arrays.values() if value.ndim == 3), None)
+    deep = next((value.shape for key, value in arrays.items() if value.ndim == 3 and is_place(key)), None)
     if deep is None:
         yield Table(name, arrays)
         return
