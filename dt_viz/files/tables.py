@@ -78,7 +78,7 @@ class Table:
     """Arrays (T,) or (T, k) of numbers, or (T,) of text; a matrix without a name has the name ""."""
     place: Callable[[int], str] = at_sample
     """Describes the place of a row in the file."""
-    units: Mapping[str, float] = field(default_factory=dict)
+    units: dict[str, float] = field(default_factory=dict)
     """Sizes of the units of lengths, times and angles, as far as the format says."""
     unused: tuple[str, ...] = ()
     """Names of columns that were not read."""
@@ -126,13 +126,13 @@ def read_text(file: BinaryIO, source: Path, options: ReadOptions) -> Iterator[Ta
     converters = {k: lambda cell: labels.setdefault(cell.strip(), len(labels)) for k in used if label[k]}
     lines = (line for _, line in itertools.islice(_rows(file, skipped, delimiter), max_rows + 1))
     try:
-        rows = np.loadtxt(
+        rows = np.loadtxt(  # pyright: ignore[reportCallIssue]  # its stubs know no types by field
             lines,
-            dtype=fields,
+            dtype=np.dtype(fields),
             delimiter=delimiter,
             quotechar='"',
             comments=None,
-            converters=converters,  # pyright: ignore[reportArgumentType]
+            converters=converters,
             ndmin=1,
             encoding=None,
         )

@@ -43,7 +43,7 @@ class Take:
     joint_names: tuple[str, ...]
     place: Callable[[int], str]
     """Describes the place of a sample in the file, for messages."""
-    units: Mapping[str, float]
+    units: dict[str, float]
     """Sizes of the units of "length", "time" and "angle", as far as the file says."""
 
 

@@ -52,6 +52,11 @@ def refusal(content, name, **options):
     return message
 
 
+def assert_turns(demonstration, turns, atol=1e-12):
+    assert demonstration.orientations is not None
+    np.testing.assert_allclose(demonstration.orientations, turns, atol=atol)
+
+
 def assert_same(demonstration, positions, times=TIMES):
     np.testing.assert_allclose(demonstration.positions, positions, rtol=1e-12)
     np.testing.assert_allclose(demonstration.times, times - times[0], rtol=1e-9, atol=1e-9)
@@ -105,7 +110,7 @@ class TestText:
         np.testing.assert_allclose(read.times, TIMES, atol=1e-6)
         assert (read.orientations is not None) == ("w" in header)
         if read.orientations is not None:
-            np.testing.assert_allclose(read.orientations, wxyz(turns), atol=1e-12)
+            assert_turns(read, wxyz(turns))
 
     @given(
         st.sampled_from(["t", "time", "timestamp", "Stamp", "elapsed"]),
@@ -258,11 +263,11 @@ class TestArrays:
         (read,) = load_demonstrations(path, unit="ms,mm" if "timestamps" in arrays else None)
         assert_same(read, path_of())
         if "ee_quat" in arrays:
-            np.testing.assert_allclose(read.orientations, wxyz(turns_of()), atol=1e-12)
+            assert_turns(read, wxyz(turns_of()))
 
     def test_several_takes_of_named_arrays(self, tmp_path):
         takes = {f"take_{k}": path_of(k, 40 + k) for k in range(3)}
-        np.savez(tmp_path / "a.npz", **takes)
+        np.savez(tmp_path / "a.npz", **takes)  # pyright: ignore[reportArgumentType]
         scipy.io.savemat(tmp_path / "b.mat", takes)
         records = [
             {"name": f"take_{k}", "times": np.arange(40 + k) / 50, "positions": takes[f"take_{k}"]} for k in range(3)
@@ -304,7 +309,7 @@ class TestArrays:
         save_demonstrations(tmp_path / "a.npz", [saved])
         (read,) = load_demonstrations(tmp_path / "a.npz")
         assert_same(read, saved.positions)
-        np.testing.assert_allclose(read.orientations, saved.orientations, atol=1e-12)
+        assert_turns(read, saved.orientations)
 
 
 class TestOrientations:
@@ -315,9 +320,8 @@ class TestOrientations:
             tmp_path / "a.npz", t=TIMES, pos=path_of(), **{name: turns * np.where(np.arange(60) % 2, -1, 1)[:, None]}
         )
         (read,) = load_demonstrations(tmp_path / "a.npz")
-        assert read.orientations is not None
-        np.testing.assert_allclose(read.orientations, wxyz(turns_of()), atol=1e-12)
-        assert not read.orientations.flags.writeable
+        assert_turns(read, wxyz(turns_of()))
+        assert read.orientations is not None and not read.orientations.flags.writeable
 
 
 class Planar:
@@ -440,7 +444,7 @@ class TestHdf5:
         read = load_demonstrations(tmp_path / "low_dim.hdf5")
         assert [d.name for d in read] == ["demo_0", "demo_1", "demo_10"]
         assert_same(read[2], path_of(10))
-        np.testing.assert_allclose(read[2].orientations, wxyz(turns_of()), atol=1e-12)
+        assert_turns(read[2], wxyz(turns_of()))
 
     def test_plain_arrays(self, tmp_path):
         h5py = pytest.importorskip("h5py")
@@ -527,7 +531,7 @@ class TestBags:
         for read in (load_demonstrations(path), read_demonstrations(path.read_bytes(), f"take{suffix}")):
             assert len(read) == 1
             assert_same(read[0], path_of())
-            np.testing.assert_allclose(read[0].orientations, wxyz(turns_of()), atol=1e-12)
+            assert_turns(read[0], wxyz(turns_of()))
         if suffix != ".bag":
             assert_same(load_demonstrations(path.parent)[0], path_of())
 
