@@ -52,10 +52,11 @@ def _serve(options: argparse.Namespace) -> int:
     # numerical libraries read these when they are first imported
     from dt_viz.errors import DataError  # noqa: PLC0415
     from dt_viz.folders import default_cache_folder  # noqa: PLC0415
+    from dt_viz.learning.demonstrations import load_demonstrations  # noqa: PLC0415
     from dt_viz.learning.imitation import ImitationError  # noqa: PLC0415
     from dt_viz.learning.store import FitStore  # noqa: PLC0415
     from dt_viz.robot.models import load_jaco  # noqa: PLC0415
-    from dt_viz.scenario.tasks import known_tasks  # noqa: PLC0415
+    from dt_viz.scenario.tasks import OWN, TaskEntry, known_tasks, own_task  # noqa: PLC0415
     from dt_viz.ui.patches import GateError  # noqa: PLC0415
     from dt_viz.ui.server import AddressError, Server  # noqa: PLC0415
 
@@ -63,12 +64,17 @@ def _serve(options: argparse.Namespace) -> int:
     handler.addFilter(RateLimitFilter())
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s", handlers=[handler])
     try:
-        tasks = known_tasks(options.lasa)
-        if options.task not in tasks:
-            print(f"{PROG}: --task: found {options.task!r}; accepted: {', '.join(tasks)}", file=sys.stderr)
+        tasks, robot = known_tasks(options.lasa), load_jaco()
+        if options.files:
+            how = {name: getattr(options, name) for name in ("rate", "unit", "columns", "topic")}
+            own = own_task(load_demonstrations(options.files, **how, arm=robot))
+            tasks = {OWN: TaskEntry(own.title, lambda: own), **tasks}
+        begin = options.task or (OWN if options.files else "draw_s")
+        if begin not in tasks:
+            print(f"{PROG}: --task: found {begin!r}; accepted: {', '.join(tasks)}", file=sys.stderr)
             return 2
-        fits, robot = FitStore(default_cache_folder()), load_jaco()
-        first = tasks[options.task]()
+        fits = FitStore(default_cache_folder())
+        first = tasks[begin]()
         if options.prepare_all:
             for name in tasks:
                 task = tasks[name]()
@@ -79,7 +85,7 @@ def _serve(options: argparse.Namespace) -> int:
             tasks,
             fits,
             robot,
-            task=options.task,
+            task=begin,
             host=options.host,
             port=options.port,
             max_sessions=options.max_sessions,
@@ -130,7 +136,17 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: %(default)s)")
     parser.add_argument("--port", type=_port, default=8080, help="port to listen on (default: %(default)s)")
-    parser.add_argument("--task", default="draw_s", help="task to begin with (default: %(default)s)")
+    parser.add_argument(
+        "files",
+        nargs="*",
+        metavar="FILE",
+        help="your own demonstrations: text, .npz, .npy, .mat, .json, .parquet, .hdf5, ROS bags, or folders of them",
+    )
+    parser.add_argument("--rate", type=float, metavar="HZ", help="samples per second of files without times")
+    parser.add_argument("--unit", metavar="UNIT", help="units of the files, such as mm or cm,ms,deg, if not recognised")
+    parser.add_argument("--columns", metavar="NAMES", help="names of the files' columns in order, such as t,x,y,z")
+    parser.add_argument("--topic", metavar="TOPIC", help="topic of a bag, or frame of its transforms")
+    parser.add_argument("--task", help="task to begin with (default: your own data, else draw_s)")
     parser.add_argument(
         "--prepare-all",
         action="store_true",

@@ -10,6 +10,7 @@ import threading
 from contextlib import AsyncExitStack, contextmanager
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import dt_viz
@@ -116,6 +117,27 @@ def test_every_task_is_learned_before_it_is_ready_if_asked_with_a_line_for_each(
     printed, errors = capsys.readouterr()
     assert re.findall("Ready: (.*)", printed) == [entry.title for entry in TASKS.values()]
     assert "it would be ready" in errors
+
+
+def test_own_files_are_the_task_that_the_page_begins_with(monkeypatch, tmp_path, capsys):
+    s = np.linspace(0, 1, 60)
+    for k in range(2):
+        path = np.stack([300 * s, 100 * s**2 + 10 * k, 200 - 50 * s], axis=1)
+        np.savetxt(tmp_path / f"{k}.csv", path, delimiter=",", header="x,y,z", comments="")
+
+    def serve(tasks, _fits, *, task, **_how):
+        shown = tasks[task]()
+        assert (task, shown.title, len(shown.paths)) == ("own_data", "Own data", 2)
+        assert {*TASKS} < {*tasks}
+        np.testing.assert_allclose(shown.paths[0][-1], [0.3, 0.1, 0.15])
+        assert shown.demonstrations[0].duration == pytest.approx(59 / 30)
+        raise AddressError("it would be ready")
+
+    monkeypatch.setattr(server, "Server", serve)
+    assert main([str(tmp_path), "--rate", "30", "--unit", "mm"]) == 2
+    assert "it would be ready" in capsys.readouterr().err
+    assert main([str(tmp_path), "--columns", "x,y"]) == 2
+    assert "0.csv: columns: found 2 names for 3 columns; accepted: 3 names" in capsys.readouterr().err
 
 
 def test_handlers_of_signals_are_as_before_when_it_returns(capsys):

@@ -39,9 +39,10 @@ from dt_viz.evaluate import figures
 from dt_viz.evaluate.figures import FigurePanel
 from dt_viz.evaluate.held_out import WAYS, Followed, Learn, begun, follow, frechet, rollouts_from
 from dt_viz.evaluate.options import InputError, ready_folder, report, whole_number, write_json, write_npz
+from dt_viz.files.archives import LASA_UNITS
 from dt_viz.flows.diffeomorphisms import min_det_jacobian, round_trip_error
 from dt_viz.flows.fields import Array
-from dt_viz.learning.demonstrations import METRES_PER_LASA_UNIT, Demonstration, load_demonstrations
+from dt_viz.learning.demonstrations import Demonstration, load_demonstrations
 from dt_viz.learning.imitation import OBJECTIVES, ImitationError, ImitationSettings, grown_grid
 from dt_viz.learning.interface import AnyImitation
 from dt_viz.learning.state import learn as learn_in_state
@@ -88,7 +89,9 @@ class ImitationFigures:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the command's arguments."""
-    parser.add_argument("files", type=Path, nargs="+", metavar="SHAPE", help="LASA .mat, .npz, .csv or folder of .csv")
+    parser.add_argument("files", type=Path, nargs="+", metavar="SHAPE", help="file or folder of demonstrations")
+    parser.add_argument("--rate", type=float, metavar="HZ", help="samples per second of files without times")
+    parser.add_argument("--unit", metavar="UNIT", help="units of the files, such as mm or cm,ms, if not recognised")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for arrays and figures")
     parser.add_argument("--objective", choices=OBJECTIVES, default=OBJECTIVES[0], help="default: %(default)s")
     parser.add_argument("--state", choices=STATES, default=STATES[0], help="default: %(default)s")
@@ -102,7 +105,8 @@ def run(options: argparse.Namespace) -> int:
     if options.state == "augmented" and options.objective != OBJECTIVES[0]:
         raise InputError("--objective", options.objective, "none with --state augmented, whose fit has no objective")
     learn: Learn = partial(learn_in_state, settings=ImitationSettings(options.objective), state=options.state)
-    sources, holds_out = _sources(options.files), options.leave_one_out or options.folds is not None
+    sources = _sources(options.files, options.rate, options.unit)
+    holds_out = options.leave_one_out or options.folds is not None
     alone = ", ".join(str(source.path) for source in sources if len(source.demonstrations) == 1)
     if holds_out and alone:
         raise InputError("--leave-one-out", f"one demonstration only in {alone}", "two or more in each")
@@ -267,15 +271,15 @@ def worst_of(cases: Sequence[tuple[float, FigurePanel]], num: int = 9) -> list[t
     return sorted(cases, key=lambda case: -case[0])[:num]
 
 
-def _sources(paths: Sequence[Path]) -> list[Source]:
+def _sources(paths: Sequence[Path], rate: float | None, unit: str | None) -> list[Source]:
     """Read all files."""
     sources: dict[str, Source] = {}
     for path in paths:
         if path.stem in sources:
             found = f"{str(sources[path.stem].path)!r} and {str(path)!r}, which would both become {path.stem}.npz"
             raise InputError("SHAPE", found, "files of different names")
-        unit = METRES_PER_LASA_UNIT if path.suffix.lower() == ".mat" else 1.0
-        sources[path.stem] = Source(path, load_demonstrations(path), unit)
+        size = LASA_UNITS["length"] if path.suffix.lower() == ".mat" else 1.0
+        sources[path.stem] = Source(path, load_demonstrations(path, rate=rate, unit=unit), size)
     return list(sources.values())
 
 

@@ -28,17 +28,17 @@ def read_bytes(path: Path, max_bytes: int) -> bytes:
     return path.read_bytes()
 
 
-def checked_suffix(content: bytes, source: Path, accepted: Collection[str], max_bytes: int) -> str:
+def checked_suffix(num_bytes: int, source: Path, accepted: Collection[str], max_bytes: int) -> str:
     """Return the suffix of a file's name in lower case.
 
     Raises:
-        FormatError: the suffix is none of the `accepted` ones, or the content is empty or larger than `max_bytes`.
+        FormatError: the suffix is none of the `accepted` ones, or the file is empty or larger than `max_bytes`.
     """
     suffix = source.suffix.lower()
     if suffix not in accepted:
         raise FormatError("suffix", repr(source.suffix) if suffix else "no suffix", ", ".join(accepted))
-    check_size(len(content), max_bytes)
-    if not content:
+    check_size(num_bytes, max_bytes)
+    if not num_bytes:
         raise FormatError("file", "an empty file", f"a {suffix} file with content")
     return suffix
 

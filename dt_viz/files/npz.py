@@ -9,18 +9,20 @@ import zipfile
 from collections.abc import Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from dt_viz.errors import FormatError
 
 
-def arrays_of(content: bytes, *, max_bytes: int, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
+def arrays_of(
+    content: bytes | BinaryIO, *, max_bytes: int, names: Collection[str] | None = None
+) -> dict[str, np.ndarray]:
     """Read the arrays of an npz archive.
 
     Args:
-        content: all bytes of the file.
+        content: all bytes of the file, or the file.
         max_bytes: largest number of bytes that it may unpack to, as its directory says.
         names: names of the arrays to read; None reads all.
 
@@ -28,14 +30,16 @@ def arrays_of(content: bytes, *, max_bytes: int, names: Collection[str] | None =
         FormatError: it unpacks to more.
         Exception: of almost any kind, if it is no archive, damaged, or holds pickled objects.
     """
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+    file = io.BytesIO(content) if isinstance(content, bytes) else content
+    with zipfile.ZipFile(file) as archive:
         size = sum(member.file_size for member in archive.infolist())
     if size > max_bytes:
         raise FormatError("file", f"{size} bytes when unpacked", f"at most {max_bytes} bytes")
     if names is not None and not names:
         return {}
     arrays = {}
-    with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+    file.seek(0)
+    with np.load(file, allow_pickle=False) as archive:
         for name in archive.files if names is None else [name for name in names if name in archive.files]:
             accepted = "numbers or text as numpy writes them; pickled objects are never opened"
             try:

@@ -1,70 +1,39 @@
-"""Demonstrations: recorded motions, their checks, and their files.
+"""Demonstrations: recorded motions and their checks. `dt_viz.files.takes` reads their files.
 
-Three kinds of file are read, and a folder of the first:
-
-CSV (``.csv``), UTF-8, one header line and then one line per sample, seconds and metres::
-
-    demo,t,x,y,z
-    first,0.00,0.10,0.20,0.30
-    first,0.04,0.11,0.20,0.30
-    second,0.00,0.12,0.21,0.30
-
-    Columns are found by their names, in any order; others are left out, and a log line names them.
-
-    - ``demo`` is any label; lines with the same label are one demonstration, in the order they stand in. Without it
-      the file is a single demonstration.
-    - ``t``, ``time``, ``timestamp`` or ``stamp``, perhaps with a unit (``time_ms``, ``stamp_ns``); ``%time`` of
-      ``rostopic echo -p`` is nanoseconds. Without it the samples have equal distances in time: `rate` samples per
-      second, or `UNTIMED` seconds in all.
-    - ``x``, ``y``, ``z``, also as ``pos_x``, ``position.x`` or ``field.pose.position.x``. ``z`` is left out for
-      motions in the plane.
-
-    Of a folder, every CSV file is read, in the order of their names.
-
-npz (``.npz``), seconds and metres, for i = 0, 1, 2, …:
-    ``times_i`` (T,), ``positions_i`` (T, d), and optionally ``name_i``, a string. Pickled arrays are never opened.
-
-LASA handwriting (``.mat``, MATLAB v5 to v7), seconds and millimetres:
-    ``demos``, a cell array (or array) of structures with ``t`` 1×T and ``pos`` d×T; nothing else in it is used.
+They are saved as npz, seconds and metres, for i = 0, 1, 2, …: ``times_i`` (T,), ``positions_i`` (T, d), and optionally
+``orientations_wxyz_i`` (T, 4) and ``name_i``, a string.
 """
 
-import csv
 import io
 import logging
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, Protocol
 
 import numpy as np
-import scipy.io
 
 from dt_viz.errors import DataError, FormatError, naming, parsing
-from dt_viz.files.checks import check_at_most, check_finite, checked_suffix, read_bytes, real_numbers
-from dt_viz.files.npz import arrays_of
+from dt_viz.files.checks import check_at_most, check_finite, real_numbers
+from dt_viz.files.folders import bag_folder, files_of, is_bag, is_lerobot, lerobot_folder
+from dt_viz.files.tables import ReadOptions, at_sample
+from dt_viz.files.takes import READERS, Take, in_si_units, read_takes
 
 logger = logging.getLogger(__name__)
 
 DIMENSIONS = (2, 3)
-MAX_BYTES = 16 * 2**20
-"""Largest number of bytes of a file, and of what an npz unpacks to; some 300,000 samples."""
 MAX_DEMONSTRATIONS = 1000
 MAX_NAME = 1000
 """Largest number of characters of a name."""
-UNTIMED = 5.0
-"""Duration of a demonstration of a table without times or rate, seconds."""
-TIME = re.compile(r"(?:t|time|timestamp|stamp)(?:[_ .]?[(\[]?(s|ms|us|ns)[)\]]?)?|(%time)")
-"""Names of the column of times, and the unit they end in."""
-SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-COORDINATE = re.compile(r"(?:.*[._/ ])?(?:p|pos|position)[._/ ]?([xyz])")
-"""Names of the columns of positions other than x, y, z."""
-ACCEPTED = "columns x, y and perhaps z, t and demo, such as 't,x,y,z' or 'timestamp,pos_x,pos_y,pos_z'"
 MAX_COORDINATE, MAX_DURATION = 100.0, 3600.0
 """Largest coordinate (m) and duration (s); numbers beyond them are in another unit."""
 MIN_EXTENT = 1e-6
 """Smallest extent of a motion, metres; a smaller one is a point."""
-METRES_PER_LASA_UNIT = 1e-3
+Found = tuple[Path, Sequence[Take], Sequence[str]]
+"""A file, its takes, and notes about them."""
+Places = Sequence[Callable[[int], str]]
+"""For each demonstration, what describes the place of a sample in its file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,11 +44,13 @@ class Demonstration:
         times: shape ``(T,)``, seconds, strictly increasing from 0.
         positions: shape ``(T, d)``, metres, d is 2 or 3, in the frame of the task.
         name: name on the page and in messages.
+        orientations: shape ``(T, 4)``, unit quaternions wxyz of the hand, where the data have them.
     """
 
     times: np.ndarray
     positions: np.ndarray
     name: str = ""
+    orientations: np.ndarray | None = None
 
     @property
     def dimension(self) -> int:
@@ -101,8 +72,21 @@ class DemonstrationError(DataError):
     """A demonstration that cannot be used."""
 
 
+class Kinematics(Protocol):
+    """What turns joint angles into places of the hand, such as `dt_viz.robot.robot.Robot`."""
+
+    @property
+    def joint_names(self) -> Sequence[str]:
+        """Names of the n joints, from the base to the hand."""
+        ...
+
+    def end_effector(self, q: np.ndarray) -> np.ndarray:
+        """Compute the positions (T, 3) of the hand, metres, at joint angles q (T, n), rad."""
+        ...
+
+
 def check_demonstrations(
-    demonstrations: Sequence[Demonstration], source: str | Path, lines: Sequence[Sequence[int]] | None = None
+    demonstrations: Sequence[Demonstration], source: str | Path, places: Places | None = None
 ) -> tuple[Demonstration, ...]:
     """Check recorded motions and bring them into the one form that the rest of the program trusts.
 
@@ -111,7 +95,7 @@ def check_demonstrations(
     Args:
         demonstrations: times ``(T,)`` in seconds from any start, positions ``(T, d)`` in metres, any real number type.
         source: the file or recording, for messages.
-        lines: for each demonstration, the line of the file that each sample stands on, for messages;
+        places: for each demonstration, what describes the place of a sample in the file, for messages;
             without it, samples are counted from 1.
 
     Returns:
@@ -125,11 +109,11 @@ def check_demonstrations(
     with naming(DemonstrationError, source):
         check_at_most("demonstrations", len(demonstrations), MAX_DEMONSTRATIONS)
         checked = []
-        for demonstration, (times, positions) in zip(demonstrations, samples_of(demonstrations, lines), strict=True):
-            name = demonstration.name
+        for demonstration, (times, positions) in zip(demonstrations, samples_of(demonstrations, places), strict=True):
+            name, orientations = demonstration.name, demonstration.orientations
             if len(name) > MAX_NAME or re.search("[\ud800-\udfff]", name):  # a page cannot be sent half a character
                 raise FormatError("name", repr(name[:40]), f"text of at most {MAX_NAME} characters")
-            where = _places(lines, len(checked))
+            where = at_sample if places is None else places[len(checked)]
             farthest = np.abs(positions).max(axis=1)
             if farthest.max() > MAX_COORDINATE:
                 found = f"{farthest.max():.6g} m {where(int(farthest.argmax()))}; is the file in millimetres?"
@@ -141,20 +125,22 @@ def check_demonstrations(
                 raise FormatError(f"times of {name!r}", found, accepted)
             if np.ptp(positions, axis=0).max() < MIN_EXTENT:
                 raise FormatError(f"positions of {name!r}", "a motion that stays at one point", "a motion")
+            if orientations is not None:
+                orientations = _checked_orientations(orientations, len(times), name, where)
             times.setflags(write=False)
             positions.setflags(write=False)
-            checked.append(Demonstration(times, positions, name))
+            checked.append(Demonstration(times, positions, name, orientations))
     return tuple(checked)
 
 
 def samples_of(
-    demonstrations: Sequence[Demonstration], lines: Sequence[Sequence[int]] | None = None
+    demonstrations: Sequence[Demonstration], places: Places | None = None
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return the times (T,) from 0 and the positions (T, d) of demonstrations as new float64 arrays.
 
     Args:
         demonstrations: recorded motions.
-        lines: as in :func:`check_demonstrations`.
+        places: as in :func:`check_demonstrations`.
 
     Raises:
         FormatError: there are none, they differ in dimension, or one of them has not the shapes, the number of samples,
@@ -164,7 +150,7 @@ def samples_of(
         raise FormatError("demonstrations", "none", "at least one")
     samples = []
     for i, demonstration in enumerate(demonstrations):
-        name, where = demonstration.name, _places(lines, i)
+        name, where = demonstration.name, at_sample if places is None else places[i]
         times_field, positions_field = f"times of {name!r}", f"positions of {name!r}"
         times = real_numbers(demonstration.times, times_field)
         positions = real_numbers(demonstration.positions, positions_field)
@@ -194,61 +180,188 @@ def samples_of(
     return samples
 
 
-def _places(lines: Sequence[Sequence[int]] | None, index: int) -> Callable[[int], str]:
-    """Return what describes the place of a sample of the demonstration with this index."""
-    return lambda row: f"at sample {row + 1}" if lines is None else f"at line {lines[index][row]}"
+def _checked_orientations(orientations: np.ndarray, num: int, name: str, where: Callable[[int], str]) -> np.ndarray:
+    """Return unit quaternions (T, 4) as a new read-only array; raise FormatError if they are none."""
+    field = f"orientations of {name!r}"
+    turns = real_numbers(orientations, field)
+    if turns.shape != (num, 4):
+        raise FormatError(field, f"an array of shape {turns.shape}", f"quaternions wxyz, ({num}, 4)")
+    check_finite(turns, field, where)
+    lengths = np.linalg.norm(turns, axis=1, keepdims=True)
+    if not lengths.all():
+        raise FormatError(field, f"a zero {where(int(lengths.argmin()))}", "unit quaternions wxyz")
+    turns /= lengths
+    turns.setflags(write=False)
+    return turns
 
 
-def load_demonstrations(path: str | Path, *, rate: float | None = None) -> tuple[Demonstration, ...]:
-    """Read the demonstrations of a file (CSV, npz, LASA .mat) or of a folder of CSV files.
+def load_demonstrations(
+    path: str | Path | Sequence[str | Path],
+    *,
+    rate: float | None = None,
+    unit: str | None = None,
+    columns: str | Sequence[str] | Mapping[str, str] | None = None,
+    topic: str | None = None,
+    arm: Kinematics | None = None,
+) -> tuple[Demonstration, ...]:
+    """Read the demonstrations of files and folders: tables of text, arrays, MATLAB, JSON, Parquet, HDF5, ROS bags.
+
+    Columns, or named arrays, are found by their names (``t``, ``time_ms``, ``stamp.sec``; ``x``, ``pos_x``,
+    ``pose.position.x``, ``tool0 x``; ``qx``, ``ori.w``; ``joint1``; ``demo``, ``episode_index``), units by their sizes.
+    Takes in one file are told apart by labels, or by times that begin again. Log lines say what was recognised and
+    what is not used.
 
     Args:
-        path: the file, whose suffix says what it is (see the module's docstring), or the folder.
-        rate: samples per second (Hz) of tables without times; None takes them as `UNTIMED` seconds long.
+        path: a file, whose suffix says what it is; a folder, of which every such file is read in the order of their
+            names (or a LeRobot data set, or a ROS bag); or several of them.
+        rate: samples per second (Hz) of takes without times; None takes them as 5 s long.
+        unit: units of lengths, times and angles, such as "mm" or "cm,ms,deg"; None recognises them.
+        columns: names of the columns in their order, such as "t,x,y,z", or the columns to use by what they are,
+            such as ``{"x": "column", "y": "other"}``; None finds them.
+        topic: topic of a bag, or frame of its transforms; None takes the only one with poses.
+        arm: what turns joint angles into places of the hand: an arm, or anything with `joint_names` and
+            `end_effector`.
 
     Raises:
-        DemonstrationError: there is no such file or folder, it cannot be read, is not what its suffix says, or holds
-            demonstrations that :func:`check_demonstrations` refuses; or there are times beside a rate.
+        DemonstrationError: there is no such file or folder, it cannot be read, is not what its suffix says, needs a
+            package that is not installed, has columns that are not clear, or holds demonstrations that
+            :func:`check_demonstrations` refuses; or there are times beside a rate, or joint angles without an arm.
     """
-    path = Path(path)
-    with parsing(DemonstrationError, path, "path", "a readable file or folder"):
-        if path.is_dir():
-            return _load_csv_folder(path, rate)
-        if not path.exists():
-            raise FormatError("path", "no such file or folder", "a readable file or folder")
-        content = read_bytes(path, MAX_BYTES)
-    return read_demonstrations(content, path, rate=rate)
+    options = ReadOptions(rate, unit, columns, topic, _num_joints(arm))
+    sources = [Path(path)] if isinstance(path, str | Path) else [*map(Path, path)]
+    found = [read for source in sources for read in _found_in(source, options)]
+    return demonstrations_of(found, ", ".join(map(str, sources))[:200], arm)
 
 
-def read_demonstrations(content: bytes, source: str | Path, *, rate: float | None = None) -> tuple[Demonstration, ...]:
-    """Read the demonstrations in the bytes of a file.
+def read_demonstrations(
+    content: bytes,
+    source: str | Path,
+    *,
+    rate: float | None = None,
+    unit: str | None = None,
+    columns: str | Sequence[str] | Mapping[str, str] | None = None,
+    topic: str | None = None,
+    arm: Kinematics | None = None,
+) -> tuple[Demonstration, ...]:
+    """Read the demonstrations in the bytes of a file; arguments and errors as of :func:`load_demonstrations`.
 
     Args:
         content: all bytes of the file.
         source: its name or path; the suffix says what it is, the stem names demonstrations that have no name.
-        rate: as for :func:`load_demonstrations`.
+        rate: see there.
+        unit: see there.
+        columns: see there.
+        topic: see there.
+        arm: see there.
+    """
+    options = ReadOptions(rate, unit, columns, topic, _num_joints(arm))
+    return demonstrations_of([_read(io.BytesIO(content), Path(source), options)], source, arm)
+
+
+def demonstrations_of(
+    found: Sequence[Found], source: str | Path, arm: Kinematics | None = None
+) -> tuple[Demonstration, ...]:
+    """Make demonstrations of the takes of one or several files; log lines say what was recognised or is not used.
+
+    Args:
+        found: for each file its path, its takes and notes about them, as `read_takes` gives them.
+        source: the files or the folder, for messages.
+        arm: as for :func:`load_demonstrations`.
 
     Raises:
         DemonstrationError: as :func:`load_demonstrations`.
     """
-    source = Path(source)
+    said: dict[str, list[Path]] = {}
+    for path, _, notes in found:
+        for note in notes:
+            said.setdefault(note, []).append(path)
+    for note, paths in said.items():
+        logger.warning("%s%s: %s", paths[0], f" and {len(paths) - 1} more" * (len(paths) > 1), note)
+    with parsing(DemonstrationError, source, "takes", "recorded motions"):
+        takes, note = in_si_units([take for _, some, _ in found for take in some])
+        if note:
+            logger.warning("%s: %s", source, note)
+        check_at_most("demonstrations", len(takes), MAX_DEMONSTRATIONS)
+        kinds = {take.positions is None: take.name for take in takes}
+        if len(kinds) > 1:
+            what = f"joint angles in {kinds[True]!r} but places of the hand in {kinds[False]!r}"
+            raise FormatError("columns", what, "one kind for all")
+    demonstrations: list[Demonstration] = []
+    for path, some, _ in found:
+        mine, takes = takes[: len(some)], takes[len(some) :]
+        with parsing(DemonstrationError, path, "takes", "recorded motions"):
+            given = [Demonstration(take.times, _hand(take, arm), take.name, take.orientations) for take in mine]
+        demonstrations += check_demonstrations(given, path, [take.place for take in mine])
     with naming(DemonstrationError, source):
-        suffix = checked_suffix(content, source, _READERS, MAX_BYTES)
-        if rate is not None and not (suffix == ".csv" and 0 < rate < np.inf):
-            raise FormatError("rate", f"{rate} for a {suffix} file", "samples per second, above 0, of a .csv file")
-    read, accepted = _READERS[suffix]
+        if not demonstrations:
+            raise FormatError("demonstrations", "none", "at least one")
+        first = demonstrations[0]
+        if others := [d for d in demonstrations if d.dimension != first.dimension]:
+            what = f"{first.dimension} in {first.name!r} but {others[0].dimension} in {others[0].name!r}"
+            raise FormatError("dimension", what, "one dimension for all")
+    return tuple(demonstrations)
+
+
+def _found_in(path: Path, options: ReadOptions) -> list[Found]:
+    """Read a file, or the files of a folder."""
+    with parsing(DemonstrationError, path, "path", "a readable file or folder"):
+        if not path.is_dir():
+            if not path.is_file():
+                raise FormatError("path", "no such file or folder", "a readable file or folder")
+            with path.open("rb") as file:
+                return [_read(file, path, options)]
+        if is_bag(path):
+            return [(path, *bag_folder(path, options))]
+        if is_lerobot(path):
+            return [(path, *lerobot_folder(path, options))]
+        if not (files := files_of(path)):
+            raise FormatError("folder", "no file of recorded motions", f"files of the kinds {', '.join(READERS)}")
+    return [read for file in files for read in _found_in(file, options)]
+
+
+def _read(file: BinaryIO, source: Path, options: ReadOptions) -> Found:
+    accepted = READERS.get(source.suffix.lower(), (None, "a file of recorded motions"))[1]
     with parsing(DemonstrationError, source, "file", accepted):
-        demonstrations, lines = read(content, source, rate)
-    return check_demonstrations(demonstrations, source, lines)
+        return (source, *read_takes(file, source, options))
+
+
+def _num_joints(arm: Kinematics | None) -> int | None:
+    return None if arm is None else len(_kinematics(arm).joint_names)
+
+
+def _kinematics(arm: Kinematics) -> Kinematics:
+    """The arm itself, or the robot of a `dt.Arm`."""
+    return getattr(arm, "robot", arm)
+
+
+def _hand(take: Take, arm: Kinematics | None) -> np.ndarray:
+    """Positions (T, d) of the hand, metres, perhaps by an arm's kinematics."""
+    q, names = take.joints, take.joint_names
+    if take.positions is not None or q is None:
+        return np.empty((0, 3)) if take.positions is None else take.positions
+    found = f"angles of {q.shape[1]} joints ({', '.join(names)[:160]})"
+    if arm is None:
+        accepted = "places of the hand, x, y and perhaps z; or name the arm that turns angles into such: arm=…"
+        raise FormatError(f"columns of {take.name!r}", found, accepted)
+    robot = _kinematics(arm)
+    wanted = list(robot.joint_names)
+    check_finite(q, f"joints of {take.name!r}", take.place)
+    if set(wanted) <= set(names):
+        return robot.end_effector(q[:, [names.index(name) for name in wanted]])
+    if len(names) not in (len(wanted), len(wanted) + 1):  # the last one may be a gripper
+        accepted = f"those of the arm's {len(wanted)} ({', '.join(wanted)[:160]}), and perhaps a gripper's behind them"
+        raise FormatError(f"columns of {take.name!r}", found, accepted)
+    return robot.end_effector(q[:, : len(wanted)].copy())
 
 
 def save_demonstrations(path: str | Path, demonstrations: Sequence[Demonstration]) -> None:
-    """Write demonstrations as npz: ``times_i``, ``positions_i`` and ``name_i`` for i = 0, 1, …."""
-    arrays: dict[str, Any] = {
-        f"{field}_{i}": np.asarray(getattr(demonstration, field))
-        for i, demonstration in enumerate(demonstrations)
-        for field in ("times", "positions", "name")
-    }
+    """Write demonstrations as npz; see the module's docstring."""
+    arrays: dict[str, Any] = {}
+    for i, demonstration in enumerate(demonstrations):
+        for field in ("times", "positions", "name"):
+            arrays[f"{field}_{i}"] = np.asarray(getattr(demonstration, field))
+        if demonstration.orientations is not None:
+            arrays[f"orientations_wxyz_{i}"] = demonstration.orientations
     np.savez_compressed(path, **arrays)
 
 
@@ -261,120 +374,8 @@ def lasa_files(folder: str | Path) -> dict[str, Path]:
     Raises:
         DemonstrationError: there is no such folder, it cannot be read, or it holds no ``.mat`` file.
     """
-    files = {path.stem: path for path in _files_of(Path(folder), ".mat")}
+    with parsing(DemonstrationError, folder, "folder", "a readable folder"):
+        files = {path.stem: path for path in files_of(Path(folder)) if path.suffix.lower() == ".mat"}
     if not files:
         raise DemonstrationError(folder, "folder", "no .mat file", "one .mat file per shape")
     return files
-
-
-def _files_of(folder: Path, *suffixes: str) -> list[Path]:
-    """Return the visible files of a folder with one of these suffixes, by name."""
-    with parsing(DemonstrationError, folder, "folder", "a readable folder"):
-        files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
-        return [path for path in files if path.suffix.lower() in suffixes]
-
-
-def _load_csv_folder(folder: Path, rate: float | None) -> tuple[Demonstration, ...]:
-    if others := _files_of(folder, ".npz", ".mat"):
-        raise FormatError("folder", f"{others[0].name!r}", "only .csv files; load other files one by one")
-    tables = _files_of(folder, ".csv")
-    if not tables:
-        raise FormatError("folder", "no .csv file", "one or more .csv files")
-    return check_demonstrations([demo for path in tables for demo in load_demonstrations(path, rate=rate)], folder)
-
-
-Read = tuple[list[Demonstration], list[list[int]] | None]
-"""Demonstrations of a file before they are checked, and for each the lines of its samples in a text file."""
-
-
-def _read_csv(content: bytes, source: Path, rate: float | None) -> Read:
-    table = csv.reader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True)
-    header = [cell.strip().lower() for cell in next(table, [])]
-    columns, second = _columns(header)
-    if "t" in columns and rate is not None:
-        raise FormatError("rate", f"{rate:g} beside a column of times", "either times or a rate")
-    if others := [name for k, name in enumerate(header) if k not in columns.values()]:
-        logger.warning("%s: columns %s are not used", source, ", ".join(others)[:200])
-    numbers = [columns[name] for name in ("t", "x", "y", "z") if name in columns]
-    samples: dict[str, list[list[float]]] = {}
-    lines: dict[str, list[int]] = {}
-    for row in table:
-        if not any(map(str.strip, row)):
-            continue
-        if len(row) != len(header):
-            raise FormatError(f"line {table.line_num}", f"{len(row)} columns", f"{len(header)}, as in the header")
-        label = row[columns["demo"]].strip() if "demo" in columns else source.stem
-        try:
-            samples.setdefault(label, []).append([float(row[column]) for column in numbers])
-        except ValueError as error:
-            raise FormatError(f"line {table.line_num}", repr(",".join(row)[:60]), "decimal numbers") from error
-        lines.setdefault(label, []).append(table.line_num)
-    demonstrations = []
-    for label, rows in samples.items():
-        values = np.array(rows)
-        if "t" in columns:
-            times, positions = second * values[:, 0], values[:, 1:]
-        else:
-            times = np.arange(len(values)) / (rate or max(len(values) - 1, 1) / UNTIMED)
-            positions = values
-        demonstrations.append(Demonstration(times, positions, label))
-    if "t" not in columns and rate is None:
-        logger.warning("%s: no times and no rate: each demonstration takes %g s, evenly sampled", source, UNTIMED)
-    return demonstrations, list(lines.values())
-
-
-def _columns(header: Sequence[str]) -> tuple[dict[str, int], float]:
-    """Find the numbers of the columns demo, t, x, y, z, those that there are, and the seconds of a unit of t."""
-    columns = {name: header.index(name) for name in ("demo", "x", "y", "z") if name in header}
-    found = [(k, match) for k, name in enumerate(header) if (match := COORDINATE.fullmatch(name))]
-    if not {"x", "y", "z"} & set(columns):
-        for k, match in found:
-            columns.setdefault(match[1], k)  # the first of several poses
-    second = 1.0
-    for k, name in enumerate(header):
-        if "t" not in columns and (match := TIME.fullmatch(name)):
-            columns["t"], second = k, 1e-9 if match[2] else SECONDS[match[1] or "s"]
-    if not {"x", "y"} <= set(columns):
-        raise FormatError("header line", repr(",".join(header)[:80]), ACCEPTED)
-    return columns, second
-
-
-def _read_npz(content: bytes, source: Path, _rate: float | None) -> Read:
-    arrays = arrays_of(content, max_bytes=MAX_BYTES)
-    accepted = "times_0, positions_0, times_1, positions_1, … and optionally name_0, name_1, …"
-    matches = {key: re.fullmatch(r"(?:times|positions|name)_(0|[1-9][0-9]{0,8})", key) for key in arrays}
-    demonstrations = []
-    for i in sorted({int(match[1]) if match else -1 for match in matches.values()}):
-        if missing := [key for key in (f"times_{i}", f"positions_{i}") if key not in arrays]:
-            wrong = [repr(key[:40]) for key, match in matches.items() if not match]
-            raise FormatError("arrays", wrong[0] if wrong else f"no {missing[0]!r}", accepted)
-        name = arrays.get(f"name_{i}", np.array(f"{source.stem} {i}"))
-        if name.dtype.kind != "U" or name.ndim:
-            raise FormatError(f"name_{i}", f"{name.dtype} of shape {name.shape}", "one string")
-        demonstrations.append(Demonstration(arrays[f"times_{i}"], arrays[f"positions_{i}"], str(name)))
-    return demonstrations, None
-
-
-def _read_lasa(content: bytes, source: Path, _rate: float | None) -> Read:
-    variables = scipy.io.loadmat(io.BytesIO(content), simplify_cells=True, variable_names=("demos",))
-    accepted = "a cell array of structures with t (1×T) and pos (d×T)"
-    if "demos" not in variables:
-        raise FormatError("variable 'demos'", "no such variable", accepted)
-    recordings = np.atleast_1d(np.asarray(variables["demos"], dtype=object)).ravel()
-    demonstrations = []
-    for i, recording in enumerate(recordings):
-        if not isinstance(recording, dict) or not {"t", "pos"} <= set(recording):
-            raise FormatError(f"demos{{{i + 1}}}", "no structure with t and pos", accepted)
-        times, positions = (real_numbers(recording[field], f"demos{{{i + 1}}}.{field}") for field in ("t", "pos"))
-        if times.ndim != 1:
-            raise FormatError(f"demos{{{i + 1}}}.t", f"an array of shape {times.shape}", "1×T")
-        demonstrations.append(Demonstration(times, positions.T * METRES_PER_LASA_UNIT, f"{source.stem} {i}"))
-    return demonstrations, None
-
-
-_READERS: dict[str, tuple[Callable[[bytes, Path, float | None], Read], str]] = {
-    ".csv": (_read_csv, "comma-separated text in UTF-8"),
-    ".npz": (_read_npz, "an npz archive of plain numbers; pickled objects are never opened"),
-    ".mat": (_read_lasa, "a MATLAB file of version 5 to 7"),
-}
-"""Reader of each kind of file, given all its bytes, its path and the rate, and the accepted content."""

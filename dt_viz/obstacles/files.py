@@ -172,7 +172,7 @@ def _suffix(content: bytes, source: Path, accepted: tuple[str, ...], scale: floa
     with naming(ShapeError, source):
         if not (np.isfinite(scale) and scale > 0):
             raise FormatError("scale", f"{scale}", "metres for one unit of the file, above 0")
-        return checked_suffix(content, source, accepted, MAX_BYTES)
+        return checked_suffix(len(content), source, accepted, MAX_BYTES)
 
 
 def _checked_size(points: Array, shape: Array, source: Path, scale: float) -> Array:

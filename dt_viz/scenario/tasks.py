@@ -27,6 +27,8 @@ DRAWING_AXES = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]).T
 DRAWING_SIZE = 0.40
 """Larger of width and height, metres, to which a drawing in other units is scaled."""
 
+OWN = "own_data"
+"""Name of the task that `own_task` makes."""
 
 POTS = (Pot(-0.16, -0.52), Pot(0.0, -0.52), Pot(0.16, -0.52))
 """Pots of `drop_pots`: left, centre and right as seen facing the robot."""
@@ -210,6 +212,35 @@ def drawing_task(
         camera=((0.79, -1.56, 0.75), (0.15, -0.33, 0.355)),
         obstacle_position=as_point(origin + scale * DRAWING_AXES[:, :2] @ middle),
         draws=True,
+    )
+
+
+def own_task(demonstrations: tuple[Demonstration, ...]) -> Task:
+    """Return a task from demonstrations that somebody brings: drawings as in `drawing_task`, others where they are.
+
+    The slice of motions in space is the plane that they are nearest to, its first axis level.
+    """
+    hint = "Drag the sphere into the way of your motion."
+    if demonstrations[0].dimension == 2:
+        return drawing_task(OWN, "Own data", hint, demonstrations)
+    points = np.concatenate([resample_by_arc_length(d.positions, 101) for d in demonstrations])
+    lower, upper = _bounds(demonstrations)
+    middle = (lower + upper) / 2
+    normal = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][2]
+    along = np.cross(normal, [0.0, 0.0, 1.0])
+    along = unit(along) if np.linalg.norm(along) > 0.1 else np.array([1.0, 0.0, 0.0])  # a level plane
+    across = unit(np.cross(along, normal))
+    axes = np.stack([along, across], axis=1)
+    half = np.ptp((points - middle) @ axes, axis=0) / 2 + 0.10
+    eye = middle + max(1.3, 3 * float((upper - lower).max())) * unit(np.array([0.5, -1.0, 0.5]))
+    return Task(
+        name=OWN,
+        title="Own data",
+        hint=hint,
+        demonstrations=demonstrations,
+        slice=Slice(middle, axes, (float(half[0]), float(half[1]))),
+        camera=(as_point(eye), as_point(middle)),
+        obstacle_position=as_point(_mean(demonstrations)[50]),
     )
 
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from dt_viz.learning.demonstrations import DemonstrationError
+from dt_viz.learning.demonstrations import Demonstration, DemonstrationError
 from dt_viz.robot.inverse_kinematics import inverse_kinematics
 from dt_viz.robot.models import load_jaco
-from dt_viz.scenario.tasks import DRAWING_SIZE, POTS, TASKS, lasa_tasks
+from dt_viz.scenario.tasks import DRAWING_SIZE, POTS, TASKS, lasa_tasks, own_task
 
 
 def write_shape(path, dim):
@@ -46,3 +46,17 @@ def test_the_arm_reaches_above_and_into_every_pot_which_catches_what_is_let_go_o
         assert pot.catches(over)
         assert not pot.catches(over + np.array([0.2 * pot.radius, 0.0, 0.0]))
         assert not pot.catches(over - np.array([0.0, 0.0, 0.11]))
+
+
+def test_own_data_become_a_task_where_they_are_with_a_slice_and_a_camera_that_look_at_them():
+    s = np.linspace(0, 1, 50)
+    paths = [np.stack([0.3 * s - 0.1, 0.1 * k - 0.5 - 0.2 * s, 0.4 - 0.3 * s * (1 - s)], axis=1) for k in range(2)]
+    task = own_task(tuple(Demonstration(2 * s, path, f"{k}") for k, path in enumerate(paths)))
+    np.testing.assert_array_equal(task.paths[1], paths[1])
+    np.testing.assert_allclose(task.slice.axes.T @ task.slice.axes, np.eye(2), atol=1e-12)
+    assert task.slice.axes[2, 0] == pytest.approx(0, abs=1e-12)
+    assert all((np.abs(task.slice.across(path)) < task.slice.half_size).all() for path in paths)
+    eye, look_at = map(np.array, task.camera)
+    assert np.linalg.norm(eye - look_at) > 1 and eye[2] > look_at[2]
+    drawing = own_task(tuple(Demonstration(2 * s, path[:, :2], f"{k}") for k, path in enumerate(paths)))
+    assert drawing.draws and drawing.title == task.title == "Own data"

@@ -1,0 +1,159 @@
+"""Readers of archives of arrays: npz, npy, MATLAB, JSON, Parquet and HDF5, none of which unpickles anything."""
+
+from __future__ import annotations
+
+import json
+import re
+import struct
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import scipy.io
+
+from dt_viz.errors import FormatError
+from dt_viz.files.checks import check_at_most, check_size, real_numbers
+from dt_viz.files.columns import role_of
+from dt_viz.files.npz import arrays_of
+from dt_viz.files.tables import LIMITS, ReadOptions, Table, imported
+from dt_viz.files.trees import tables_of
+
+LASA_UNITS = {"length": 1e-3, "time": 1.0}
+"""Units of the LASA handwriting data: millimetres and seconds."""
+
+
+def read_npz(file: BinaryIO, source: Path, _options: ReadOptions) -> Iterator[Table]:
+    """Read named arrays; ``times_i``, ``positions_i`` and ``name_i``, as this program writes them, are metres."""
+    arrays = arrays_of(file, max_bytes=LIMITS.bytes)
+    ours = all(re.fullmatch(r"(?:times|positions|orientations_wxyz|name)_\d+", key) for key in arrays)
+    for table in tables_of(arrays, source.stem):
+        yield Table(table.name, table.columns, units={"length": 1.0, "time": 1.0} if ours else {})
+
+
+def read_npy(file: BinaryIO, source: Path, _options: ReadOptions) -> Iterator[Table]:
+    """Read one array (T, d) or (N, T, d), perhaps with named fields."""
+    try:
+        array = np.load(file, allow_pickle=False)
+    except ValueError as error:
+        if "allow_pickle" not in str(error):
+            raise
+        accepted = "numbers, as np.savez(path, *takes) writes arrays of different lengths"
+        raise FormatError("array", "Python objects, which are never unpickled", accepted) from error
+    if not isinstance(array, np.ndarray):
+        raise FormatError("file", "an archive of several arrays", "one array, or the suffix .npz")
+    yield from tables_of(array, source.stem)
+
+
+def read_mat(file: BinaryIO, source: Path, _options: ReadOptions) -> Iterator[Table]:
+    """Read MATLAB variables; ``demos``, a cell array of structures with t and pos, is LASA's, in millimetres."""
+    _check_matlab(file)
+    variables = scipy.io.loadmat(file, simplify_cells=True)
+    if "demos" not in variables:
+        yield from tables_of({k: v for k, v in variables.items() if not k.startswith("__")}, source.stem)
+        return
+    recordings = np.atleast_1d(np.asarray(variables["demos"], dtype=object)).ravel()
+    for i, recording in enumerate(recordings):
+        if not isinstance(recording, dict) or not {"t", "pos"} <= set(recording):
+            accepted = "a cell array of structures with t (1×T) and pos (d×T)"
+            raise FormatError(f"demos{{{i + 1}}}", "no structure with t and pos", accepted)
+        times, positions = (real_numbers(recording[part], f"demos{{{i + 1}}}.{part}") for part in ("t", "pos"))
+        if times.ndim != 1:
+            raise FormatError(f"demos{{{i + 1}}}.t", f"an array of shape {times.shape}", "1×T")
+        if positions.ndim != 2 or len(positions) not in (2, 3):
+            raise FormatError(f"demos{{{i + 1}}}.pos", f"an array of shape {positions.shape}", "d×T, d is 2 or 3")
+        yield Table(f"{source.stem} {i}", {"t": times, "pos": positions.T}, units=LASA_UNITS)
+
+
+def _check_matlab(file: BinaryIO) -> None:
+    """Raise FormatError if a MATLAB file has elements of unknown types, which crash scipy's reader."""
+    head = file.read(128)
+    if len(head) == 128 and all(head[:4]):  # version 4 has no text there, and 7.3 is refused by scipy
+        _check_elements(memoryview(file.read()), ">" if head[126:] == b"MI" else "<")
+    file.seek(0)
+
+
+def _check_elements(data: memoryview, order: str) -> None:
+    """Check the elements that follow each other in a MATLAB file of version 5, or in a part of it."""
+    place = 0
+    while place < len(data):
+        kind, size = struct.unpack_from(f"{order}II", data, place)
+        place += 8
+        if not 1 <= kind & 0xFFFF <= 18 or (kind < 2**16 and size > len(data) - place):
+            raise FormatError("file", f"a broken element of type {kind & 0xFFFF}", "a whole MATLAB file")
+        if kind == 15:  # compressed
+            unpacked = zlib.decompressobj().decompress(data[place : place + size], LIMITS.bytes + 1)
+            check_size(len(unpacked), LIMITS.bytes)
+            _check_elements(memoryview(unpacked), order)
+        elif kind == 14:  # made of elements
+            _check_elements(data[place : place + size], order)
+        if kind < 2**16:  # the data of others stand in the place of their size
+            place += size + (-size % 8 if kind != 15 else 0)
+
+
+def read_json(file: BinaryIO, source: Path, _options: ReadOptions) -> Iterator[Table]:
+    """Read lists of numbers, records with named fields, or mappings of them."""
+    content = file.read(LIMITS.text + 1)
+    check_size(len(content), LIMITS.text)
+    yield from tables_of(json.loads(content), source.stem)
+
+
+def read_parquet(content: BinaryIO, source: Path, options: ReadOptions) -> Iterator[Table]:
+    """Read a table, such as LeRobot's: ``observation.state``, ``timestamp``, ``episode_index``."""
+    file = imported("pyarrow.parquet", "parquet").ParquetFile(content, pre_buffer=False)
+    given = {name.lower() for name in options.roles.values()}
+    kinds = {field.name: str(field.type) for field in file.schema_arrow}
+    names = [name for name in kinds if role_of(name) or name.lower() in given or "list" in kinds[name]]
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in names}
+    size = 0
+    for batch in file.iter_batches(2**16, columns=names):
+        for name, column in zip(names, batch.columns, strict=True):
+            values = (column.flatten() if "list" in kinds[name] else column).to_numpy(zero_copy_only=False)
+            size += values.size
+            check_at_most("file", size, LIMITS.numbers, "numbers")
+            whole = len(values) % len(column) == 0 and values.dtype.kind in "iuf"
+            parts[name].append(values.reshape(len(column), -1) if "list" in kinds[name] and whole else values.copy())
+    columns = {name: np.concatenate(parts.pop(name)) for name in names if parts[name]}
+    imported("pyarrow", "parquet").default_memory_pool().release_unused()
+    yield Table(source.stem, columns, unused=tuple(name for name in kinds if name not in columns))
+
+
+def read_hdf5(file: BinaryIO, source: Path, _options: ReadOptions) -> Iterator[Table]:
+    """Read groups of arrays, such as robomimic's: ``data/demo_0/obs/robot0_eef_pos``; pictures are left out."""
+    h5py = imported("h5py", "hdf5")
+    size = 0
+
+    def tree_of(group: Any) -> dict[str, Any]:  # noqa: ANN401 - a group of h5py
+        nonlocal size
+        tree = {}
+        for key in sorted(
+            group, key=lambda key: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", key)]
+        ):
+            item = group[key]
+            if isinstance(item, h5py.Group):
+                tree[key] = tree_of(item)
+            elif item.dtype.kind in "iuf" and (item.ndim < 3 or (item.ndim == 3 and item.dtype.kind == "f")):
+                size += item.size
+                check_at_most("file", size, LIMITS.numbers, "numbers")
+                tree[key] = item[()]
+        return tree
+
+    with h5py.File(file, "r") as archive:
+        tree = tree_of(archive)
+        data = archive.get("data")
+        rate = _control_rate(data.attrs.get("env_args", "")) if isinstance(data, h5py.Group) else None
+    for table in tables_of(tree, source.stem):
+        columns = table.columns if rate is None else {**table.columns, "rate": np.array(rate)}
+        yield Table(table.name, columns)
+
+
+def _control_rate(text: str) -> float | None:
+    """Rate in Hz at which robomimic's environment was recorded, if it says so."""
+    try:
+        arguments = json.loads(text)
+    except ValueError:
+        return None
+    settings = arguments.get("env_kwargs", {}) if isinstance(arguments, Mapping) else {}
+    rate = settings.get("control_freq") if isinstance(settings, Mapping) else None
+    return float(rate) if isinstance(rate, int | float) and rate > 0 else None

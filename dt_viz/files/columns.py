@@ -1,0 +1,326 @@
+"""Names of columns: which of them are times, places, orientations, joint angles or labels, and in which unit.
+
+A name is cut into words at punctuation, spaces and humps (``field.pose.position.x``, ``tool0 x``, ``posX``); a unit may
+end it (``time_ms``, ``x [mm]``). Columns that belong together share all other words.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from dt_viz.errors import FormatError
+
+UNITS: Mapping[str, tuple[str, float]] = {
+    **{"m": ("length", 1.0), "cm": ("length", 1e-2), "mm": ("length", 1e-3)},
+    **{"s": ("time", 1.0), "ms": ("time", 1e-3), "us": ("time", 1e-6), "ns": ("time", 1e-9)},
+    **{"rad": ("angle", 1.0), "deg": ("angle", np.pi / 180)},
+}
+"""Units by name: what they measure, and their size in metres, seconds or radians."""
+_SYNONYMS = {
+    **dict.fromkeys(("sec", "secs", "second", "seconds"), "s"),
+    **dict.fromkeys(("msec", "msecs", "millis", "milliseconds"), "ms"),
+    **dict.fromkeys(("usec", "usecs", "micros", "microseconds"), "us"),
+    **dict.fromkeys(("nsec", "nsecs", "nanosec", "nanosecs", "nanos", "nanoseconds"), "ns"),
+    **dict.fromkeys(("metres", "meters"), "m"),
+    **dict.fromkeys(("millimetres", "millimeters"), "mm"),
+    **dict.fromkeys(("degree", "degrees"), "deg"),
+    **dict.fromkeys(("radian", "radians"), "rad"),
+}
+TIMES = {"t", "time", "times", "timestamp", "timestamps", "stamp", "stamps", "elapsed"}
+LABELS = ("demo", "demonstration", "take", "trial", "episode", "trajectory", "traj", "run", "recording")
+RATES = {"rate", "fps", "hz", "frequency", "control_freq", "dt"}
+POSITIONS = {"p", "pos", "position", "positions", "translation", "xyz", "xy", "points", "path"}
+ORIENTATIONS = {
+    "q",
+    "quat",
+    "quats",
+    "quaternion",
+    "quaternions",
+    "ori",
+    "orientation",
+    "orientations",
+    "rot",
+    "rotation",
+    "rotations",
+}
+HAND = {
+    *("field", "pose", "poses", "point", "transform", "msg", "data", "obs", "observation", "state", "robot", "robot0"),
+    *("current", "actual", "measured", "cartesian", "cart", "base", "world", "end", "effector", "ee", "eef", "tcp"),
+    *("tool", "tool0", "hand", "gripper", "flange", "wrist", "tip"),
+}
+"""Words that tell the hand's place from nothing else in a file."""
+TOOL = {"cartesian", "tcp", "ee", "eef", "effector", "tool"}
+"""Words of which the first three numbered columns are places: ``actual_TCP_pose_0``."""
+WANTED = {"action", "actions", "cmd", "command", "target", "desired", "goal", "ref", "reference", "setpoint", "object"}
+"""Words of places that the hand has not been at."""
+WANTED_RANK = 4
+"""Rank of such places: they come after joint angles."""
+OTHERS = {
+    *("vel", "velocity", "velocities", "linear", "angular", "twist", "acc", "accel", "acceleration", "jerk"),
+    *("force", "torque", "effort", "wrench", "imu", "gyro", "mag", "rpy", "euler", "omega"),
+    *("covariance", "std", "error", "sin", "cos", "next", "reward", "rewards", "normal", "scale", "size"),
+}
+"""Words of quantities that are not used."""
+ANGLES = {"q", "j", "joint", "theta", "angle", "axis", "pos", "position", "positions"}
+"""Words of joint angles before a number."""
+JOINTS = {"joint", "joints", "qpos", "angles", "servo", "motor"}
+MAX_TURN = 4 * np.pi
+"""Largest joint angle, rad; numbers beyond it are degrees."""
+
+
+@dataclass(frozen=True)
+class Role:
+    """What a column is."""
+
+    kind: str
+    """"time", "label", "rate", "position", "orientation" or "joint"."""
+    group: tuple[str, ...] = ()
+    """Words that it shares with the columns that it belongs to."""
+    part: str = ""
+    """Its axis x, y, z or w."""
+    rank: int = 0
+    """Place among the columns of its kind: the lowest is used."""
+    unit: str = ""
+    """Its unit, a name of `UNITS`; empty if it does not say."""
+
+
+def unit_of(word: str) -> str:
+    """Return the name in `UNITS` of a unit; empty if it is none."""
+    word = _SYNONYMS.get(word, word)
+    return word if word in UNITS else ""
+
+
+@lru_cache(maxsize=4096)
+def role_of(name: str) -> Role | None:
+    """Tell what a column of numbers is by its name; None if it is not used."""
+    words = _words(name)
+    if words == ["%time"]:  # of `rostopic echo -p`
+        return Role("time", unit="ns")
+    unit = unit_of(words[-1]) if words else ""
+    if unit and len(words) > 1:
+        words.pop()
+    elif unit and UNITS[unit][0] == "time" and len(words[-1]) > 1:
+        return Role("time", rank=1, unit=unit)
+    else:
+        unit = ""
+    if "_".join(words) in RATES:
+        return Role("rate")
+    label = [word for word in words if word not in {"id", "index", "idx", "number", "no", "num", "name"}]
+    if len(label) == 1 and label[0] in LABELS:
+        return Role("label", rank=LABELS.index(label[0]))
+    if words == ["t"] or set(words) & (TIMES - {"t"}):
+        return Role("time", tuple(words), rank=len(words) - 1, unit=unit)
+    return _place(words, unit)
+
+
+def _place(words: list[str], unit: str) -> Role | None:
+    """Role of a column of places, orientations or joint angles."""
+    axes = [word for word in words if word in ("x", "y", "z", "w")]
+    group = tuple(word for word in words if word not in axes)
+    among = set(group)
+    if among & OTHERS or group in [("v",), ("a",), ("f",), ("r",)] or len(axes) > 1:
+        return None
+    if axes and among & ORIENTATIONS:
+        return None if among & WANTED else Role("orientation", group, axes[0], unit=unit)
+    if not axes and words[-1:] in (["0"], ["1"], ["2"]) and words[-2] in POSITIONS | {"pose"} and among & TOOL:
+        axes, group = ["xyz"[int(words[-1])]], group[:-1]
+    if axes and axes[0] != "w":
+        within = among <= HAND | POSITIONS | {"0", "1", "2"}
+        rank = WANTED_RANK if among & WANTED else int(bool(among)) if within else 2 if among & POSITIONS else 3
+        return Role("position", group, axes[0], rank, unit)
+    return Role("joint", unit=unit) if not axes and _is_joint(words) else None
+
+
+def _is_joint(words: list[str]) -> bool:
+    """Tell whether these words are a joint angle's: ``shoulder_pan_joint``, ``q1``, ``actual_q_0``, ``position0``."""
+    if not words or set(words) & (WANTED | {"gripper", "finger", "fingers"}):
+        return False
+    numbered = words[-1].isdecimal() and words[:-1] and words[-2] in ANGLES
+    fused = re.fullmatch(r"([a-z]+)\d+", words[-1])
+    return bool(set(words) & JOINTS or numbered or (fused and fused[1] in ANGLES))
+
+
+def _words(name: str) -> list[str]:
+    humps = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name.strip())
+    words = []
+    for word in re.findall(r"%?[^\W\d_]+\d*|\d+", humps.lower()):
+        if fused := re.fullmatch(r"(p|pos|position|t)([xyz])|(q|quat|ori)([xyzw])", word):
+            words += [part for part in fused.groups() if part]
+        else:
+            words.append(word)
+    return words
+
+
+def is_kind(name: str, kind: str) -> bool:
+    """Tell whether this is the name of a column of some kind; see `Role`."""
+    role = role_of(name)
+    return role is not None and role.kind == kind
+
+
+def is_place(name: str) -> bool:
+    """Tell whether an array of this name may be one of places."""
+    return not set(_words(name)) & (OTHERS | WANTED | ORIENTATIONS | TIMES)
+
+
+def expanded(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
+    """Name the columns of a matrix (T, k) after it, by what its name and its width say; those of a vector stay."""
+    if values.ndim != 2:
+        return {name: values}
+    words, width = set(_words(name)), values.shape[1]
+    if width == 1:
+        return {name: values[:, 0]}
+    if width == 4 and words & ORIENTATIONS:
+        parts: Iterable[str] = "wxyz" if "wxyz" in name.lower() else "xyzw"
+    elif width == 7 and words & (HAND | POSITIONS) and _is_unit(values[:, 3:]) and not words & JOINTS:
+        parts = (*(f"position.{axis}" for axis in "xyz"), *(f"orientation.{axis}" for axis in "xyzw"))
+    elif words & JOINTS or name in ("q", "state", "states", "observation.state"):
+        parts = (f"joint{k + 1}" for k in range(width))
+    elif width in (2, 3):
+        parts = "xyz"[:width]
+    else:
+        return {}
+    before = "" if name.lower() == "x" else f"{name}."
+    return {f"{before}{part}": values[:, k] for k, part in enumerate(parts)}
+
+
+def unnamed(values: np.ndarray, num_joints: int | None, *, rated: bool, timed: bool) -> list[str]:
+    """Name the columns of a matrix (T, k) without names, as far as its numbers make them clear.
+
+    Args:
+        values: the matrix.
+        num_joints: number of joints of the arm at hand.
+        rated: whether the rate is known, so that no column has times.
+        timed: whether two or three columns may begin with times.
+
+    Raises:
+        FormatError: they are not clear.
+    """
+    width = values.shape[1]
+    pose = [*"xyz", "qx", "qy", "qz", "qw"]
+    joints = [f"joint{k + 1}" for k in range(num_joints or 0)]
+    even = not rated and _is_even(values[:, 0])
+    if width in (2, 3):
+        return ["t", "x", "y"] if timed and width == 3 and even and not _is_even(values[:, 1]) else [*"xyz"[:width]]
+    if num_joints and width in (num_joints, num_joints + 1) and not _is_unit(values[:, -4:]):
+        return joints if width == num_joints else ["t", *joints]
+    if width == 4 and (even or (not rated and (np.diff(values[:, 0]) > 0).all())):
+        return ["t", *"xyz"]
+    if width == 7 and _is_unit(values[:, 3:]):
+        return pose
+    if width == 7 and _is_unit(values[:, :4]):
+        return [*pose[3:], *"xyz"]
+    if width == 8 and _is_unit(values[:, 4:]):
+        return ["t", *pose]
+    accepted = "(T, 2) or (T, 3); else say what they are, such as columns='t,x,y,z' or columns='joint1,joint2,…'"
+    raise FormatError("columns", f"{width} columns without names", accepted)
+
+
+def _is_unit(values: np.ndarray) -> bool:
+    """Tell whether these may be quaternions (T, 4)."""
+    return values.shape[1] == 4 and bool(np.abs((values**2).sum(axis=1) - 1).max(initial=0.0) < 1e-2)
+
+
+def _is_even(values: np.ndarray) -> bool:
+    """Tell whether these (T,) may be times: they grow by steps that are alike, as no hand moves."""
+    steps = np.diff(values)
+    return len(steps) > 1 and bool(steps.min() > 0 and steps.max() < 1.5 * np.median(steps) < 3 * steps.min())
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Names of the columns that are used."""
+
+    time: str = ""
+    fraction: str = ""
+    """Column of nanoseconds that belong to the seconds of `time`."""
+    label: str = ""
+    rate: str = ""
+    positions: tuple[str, ...] = ()
+    """x, y and perhaps z."""
+    orientations: tuple[str, ...] = ()
+    """w, x, y, z, or none."""
+    joints: tuple[str, ...] = ()
+
+    @property
+    def used(self) -> set[str]:
+        """All of them."""
+        named = (self.time, self.fraction, self.label, self.rate)
+        return {*named, *self.positions, *self.orientations, *self.joints} - {""}
+
+
+def layout(names: Sequence[str], others: Sequence[str] = ()) -> Layout:
+    """Find the columns of a table by their names; others of the file are for messages.
+
+    Raises:
+        FormatError: there are neither places nor joint angles, or several places that are alike.
+    """
+    roles = {name: role for name in names if (role := role_of(name))}
+    by_kind = {
+        kind: sorted((name for name in roles if roles[name].kind == kind), key=lambda name: roles[name].rank)
+        for kind in ("time", "label", "rate", "position", "orientation", "joint")
+    }
+    time, fraction = _clock(by_kind["time"], roles)
+    positions, group = _position_columns(by_kind["position"], roles, names)
+    joints = tuple(by_kind["joint"])
+    if positions and roles[positions[0]].rank < WANTED_RANK:
+        joints = ()
+    elif joints:
+        positions = ()
+    if not positions and not joints:
+        raise _unclear("no places", [*names, *others])
+    first = {kind: next(iter(by_kind[kind]), "") for kind in ("label", "rate")}
+    orientations = _orientation_columns(by_kind["orientation"], roles, group) if len(positions) == 3 else ()
+    return Layout(time, fraction, first["label"], first["rate"], positions, orientations, joints)
+
+
+def _unclear(what: str, names: Sequence[str]) -> FormatError:
+    found = f"{what} in {','.join(names)[:160]!r}"
+    accepted = (
+        "x, y and perhaps z, t, demo, or joint1, joint2, …, such as 't,x,y,z' or 'timestamp,pos_x,pos_y,pos_z'; "
+        "or say which, such as columns={'x': 'name of x', 'y': 'name of y'}"
+    )
+    return FormatError("columns", found, accepted)
+
+
+def _clock(names: Sequence[str], roles: Mapping[str, Role]) -> tuple[str, str]:
+    """Return the column of times, and that of the nanoseconds that belong to it."""
+    if not names:
+        return "", ""
+    stamps = [name for name in names if roles[name].group == roles[names[0]].group]
+    seconds = [name for name in stamps if roles[name].unit == "s"]
+    nanoseconds = [name for name in stamps if roles[name].unit == "ns"]
+    return (seconds[0], nanoseconds[0]) if seconds and nanoseconds else (names[0], "")
+
+
+def _position_columns(
+    names: Sequence[str], roles: Mapping[str, Role], given: Sequence[str]
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the columns x, y and perhaps z of one group of words, and these words."""
+    groups: dict[tuple[str, ...], dict[str, str]] = {}
+    for name in names:
+        groups.setdefault(roles[name].group, {}).setdefault(roles[name].part, name)
+    whole = {group: axes for group, axes in groups.items() if {"x", "y"} <= set(axes)}
+    if not whole:
+        return (), ()
+    best = {group: roles[axes["x"]].rank for group, axes in whole.items()}
+    alike = [group for group in whole if best[group] == min(best.values())]
+    if len(alike) > 1 and not set(alike[0]) & POSITIONS:
+        raise _unclear(f"{len(alike)} places ({', '.join(' '.join(group) for group in alike)[:80]})", given)
+    return tuple(whole[alike[0]][axis] for axis in "xyz" if axis in whole[alike[0]]), alike[0]
+
+
+def _orientation_columns(names: Sequence[str], roles: Mapping[str, Role], group: Sequence[str]) -> tuple[str, ...]:
+    """Return the columns w, x, y, z whose words are most like those of the positions; none if some are missing."""
+    groups: dict[tuple[str, ...], dict[str, str]] = {}
+    for name in names:
+        groups.setdefault(roles[name].group, {}).setdefault(roles[name].part, name)
+    whole = [axes for axes in groups.values() if len(axes) == 4]
+    if not whole:
+        return ()
+    best = max(whole, key=lambda axes: len(set(group) & set(roles[axes["x"]].group)))
+    return tuple(best[axis] for axis in "wxyz")

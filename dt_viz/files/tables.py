@@ -1,0 +1,241 @@
+"""Tables of takes: what every reader of recorded motions gives, and the reader of text."""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import io
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from dt_viz.errors import FormatError
+from dt_viz.files.checks import too_many
+from dt_viz.files.columns import role_of, unnamed
+
+
+@dataclass(frozen=True)
+class TakeLimits:
+    """The largest recordings: fifty takes of 200,000 samples with room for orientations."""
+
+    bytes: int = 512 * 2**20
+    """Bytes of a file, and of what it unpacks to."""
+    text: int = 64 * 2**20
+    """Bytes of JSON, which needs ten times as much while it is read."""
+    numbers: int = 60_000_000
+    """Numbers in the columns of a file."""
+    columns: int = 2000
+
+
+LIMITS = TakeLimits()
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """What is known of recorded motions beside their file."""
+
+    rate: float | None = None
+    """Samples per second (Hz) of takes without times."""
+    unit: str | None = None
+    """Units of lengths, times and angles, such as "mm" or "cm,ms,deg"; None recognises them."""
+    columns: str | Sequence[str] | Mapping[str, str] | None = None
+    """Names of a table's columns in their order, or the columns to use by what they are: ``{"x": "column"}``."""
+    topic: str | None = None
+    """Topic of a bag, or child frame of its transforms."""
+    num_joints: int | None = None
+    """Number of joints of the arm at hand."""
+
+    @property
+    def names(self) -> list[str] | None:
+        """Names of the columns in their order, if they are given so."""
+        if self.columns is None or isinstance(self.columns, Mapping):
+            return None
+        return [name.strip() for name in (self.columns.split(",") if isinstance(self.columns, str) else self.columns)]
+
+    @property
+    def roles(self) -> Mapping[str, str]:
+        """Columns by what they are, if they are given so."""
+        return self.columns if isinstance(self.columns, Mapping) else {}
+
+
+def at_sample(row: int) -> str:
+    """Describe the place of a row of a table that is no text."""
+    return f"at sample {row + 1}"
+
+
+@dataclass(frozen=True)
+class Table:
+    """Named columns as a file holds them, of one take or, told apart by labels or times, several."""
+
+    name: str
+    """Name of the take."""
+    columns: Mapping[str, Any]
+    """Arrays (T,) or (T, k) of numbers, or (T,) of text; a matrix without a name has the name ""."""
+    place: Callable[[int], str] = at_sample
+    """Describes the place of a row in the file."""
+    units: dict[str, float] = field(default_factory=dict)
+    """Sizes of the units of lengths, times and angles, as far as the format says."""
+    unused: tuple[str, ...] = ()
+    """Names of columns that were not read."""
+    labels: tuple[str, ...] = ()
+    """Texts of labels, of which the column of labels holds the indices."""
+
+
+def imported(module: str, extra: str) -> Any:  # noqa: ANN401 - a module
+    """Import what reads a format.
+
+    Raises:
+        FormatError: it is not installed; the message names the extra of this package that brings it.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        accepted = f"such files after: pip install 'dt-viz[{extra}]'"
+        raise FormatError("file", f"a format that needs the package {module.partition('.')[0]}", accepted) from error
+
+
+def read_text(file: BinaryIO, source: Path, options: ReadOptions) -> Iterator[Table]:
+    """Read a table of text: cells between commas, semicolons, tabs or spaces, with a header or without.
+
+    Raises:
+        FormatError: a line has other cells than the first, or one that is no number.
+    """
+    header, first, skipped, delimiter = _beginning(file)
+    if not first:
+        yield Table(source.stem, dict.fromkeys(header or ["x", "y"], np.empty(0)))
+        return
+    width = len(first)
+    if len(header or first) != width:
+        raise FormatError(f"line {skipped + 1}", f"{width} columns", f"{len(header)}, as in the header")
+    given = options.names
+    if given is not None and len(given) != width:
+        raise FormatError("columns", f"{len(given)} names for {width} columns", f"{width} names")
+    names = given or header
+    lower = {name.lower() for name in options.roles.values()}
+    wanted = [not names or role_of(names[k]) is not None or names[k].lower() in lower for k in range(width)]
+    labels: dict[str, float] = {}
+    label = [bool(names) and _is_label(names[k], options) for k in range(width)]
+    used = [k for k in range(width) if wanted[k] and (label[k] or _is_number(first[k], delimiter))]
+    max_rows = LIMITS.numbers // max(len(used), 1)
+    fields = [(f"f{k}", "f8" if k in used else "U1") for k in range(width)]
+    converters = {k: lambda cell: labels.setdefault(cell.strip(), len(labels)) for k in used if label[k]}
+    lines = (line for _, line in itertools.islice(_rows(file, skipped, delimiter), max_rows + 1))
+    try:
+        rows = np.loadtxt(  # pyright: ignore[reportCallIssue]  # its stubs know no types by field
+            lines,
+            dtype=np.dtype(fields),
+            delimiter=delimiter,
+            quotechar='"',
+            comments=None,
+            converters=converters,
+            ndmin=1,
+            encoding=None,
+        )
+    except ValueError as error:
+        raise _wrong_line(file, skipped, delimiter, used, label) or error from error
+    if len(rows) > max_rows:
+        raise too_many("file", max_rows, "lines")
+
+    path = getattr(file, "name", None)
+
+    def place(row: int) -> str:
+        with Path(path).open("rb") if path else nullcontext(file) as again:
+            number, _ = next(itertools.islice(_rows(again, skipped, delimiter), row, None))
+        return f"at line {number}"
+
+    if not names:
+        matrix = np.stack([rows[f"f{k}"] for k in used], axis=1)
+        names = unnamed(matrix, options.num_joints, rated=options.rate is not None, timed=True)
+    columns = {names[k]: rows[f"f{k}"] for k in used}
+    unused = tuple(name for k, name in enumerate(names) if k not in used)
+    yield Table(source.stem, columns, place, unused=unused, labels=tuple(labels))
+
+
+def _is_label(name: str, options: ReadOptions) -> bool:
+    wanted = options.roles.get("demo", "")
+    role = role_of(name)
+    return name.lower() == wanted.lower() if wanted else role is not None and role.kind == "label"
+
+
+def _text(file: BinaryIO) -> io.TextIOWrapper:
+    file.seek(0)
+    return io.TextIOWrapper(io.BufferedReader(_Unclosed(file), 2**20), encoding="utf-8-sig", newline="")
+
+
+class _Unclosed(io.RawIOBase):
+    """A file that is not closed with what reads it."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:  # noqa: ANN401 - a buffer
+        content = self._file.read(len(buffer))
+        buffer[: len(content)] = content
+        return len(content)
+
+
+def _beginning(file: BinaryIO) -> tuple[list[str], list[str], int, str | None]:
+    """Return the header (empty without one), the first row, the number of lines before it, and what parts cells."""
+    before: list[str] = []
+    delimiter: str | None = None
+    source = _text(file)
+    for number, line in enumerate(iter(lambda: source.readline(2**20), "")):
+        text = line.strip()
+        if not text:
+            continue
+        marked = text[0] == "#" or (text[0] == "%" and not text.lower().startswith("%time"))
+        if not before or before[0] == "#":
+            delimiter = next((mark for mark in "\t;," if mark in text), None)
+        cells = _cells(text.lstrip("#% ") if marked else text, delimiter)
+        if len(cells) > LIMITS.columns:
+            raise too_many("file", LIMITS.columns, "columns")
+        if marked:
+            before = ["#", *cells]
+        elif all(_is_number(cell, delimiter) for cell in cells) or (before and before[0] != "#"):
+            header = before[1:]
+            return (header if before[:1] != ["#"] or len(header) == len(cells) else []), cells, number, delimiter
+        else:
+            before = ["", *cells]
+    return before[1:], [], 0, delimiter
+
+
+def _cells(line: str, delimiter: str | None) -> list[str]:
+    if delimiter is None:
+        return line.split()
+    return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter, strict=True), [])]
+
+
+def _is_number(cell: str, delimiter: str | None) -> bool:
+    try:
+        float(cell.replace(",", ".") if delimiter == ";" else cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _rows(file: BinaryIO, skipped: int, delimiter: str | None) -> Iterator[tuple[int, str]]:
+    """Number and text of each line with cells, from the first row on; decimal points for commas between semicolons."""
+    for number, line in enumerate(_text(file), 1):
+        if number > skipped and line.strip():
+            yield number, line.replace(",", ".") if delimiter == ";" else line
+
+
+def _wrong_line(
+    file: BinaryIO, skipped: int, delimiter: str | None, used: Sequence[int], label: Sequence[bool]
+) -> FormatError | None:
+    """Return the error about the first line that is no row of the table."""
+    for number, line in _rows(file, skipped, delimiter):
+        cells = _cells(line.strip("\r\n"), delimiter)
+        if len(cells) != len(label):
+            return FormatError(f"line {number}", f"{len(cells)} columns", f"{len(label)}, as in the first line")
+        if not all(label[k] or _is_number(cells[k], delimiter) for k in used):
+            return FormatError(f"line {number}", repr(line.strip()[:60]), "decimal numbers")
+    return None

@@ -1,0 +1,648 @@
+"""Recorded motions in every kind of file: written by the library that usually writes it, and read back equal."""
+
+import json
+import sys
+from contextlib import suppress
+
+import numpy as np
+import pytest
+import scipy.io
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from dt_viz.files.columns import role_of
+from dt_viz.files.takes import READERS
+from dt_viz.learning.demonstrations import (
+    Demonstration,
+    DemonstrationError,
+    load_demonstrations,
+    read_demonstrations,
+    save_demonstrations,
+)
+
+TIMES = 0.02 * np.arange(60)
+RNG = np.random.default_rng(1)
+
+
+def path_of(seed=0, num=60):
+    """A motion (num, 3) within an arm's reach."""
+    return np.array([0.3, -0.4, 0.2]) + np.random.default_rng(seed).normal(scale=0.02, size=(num, 3)).cumsum(axis=0)
+
+
+def turns_of(num=60):
+    """Orientations (num, 4), xyzw, that turn steadily."""
+    return Rotation.from_rotvec(np.linspace(0, 1, num)[:, None] * [0.3, 1.0, -0.2]).as_quat()
+
+
+def wxyz(turns):
+    return np.roll(turns, 1, axis=1)
+
+
+def table(names, columns, delimiter=","):
+    rows = [delimiter.join(f"{value!r}" for value in map(float, row)) for row in np.column_stack(columns)]
+    return "\n".join([delimiter.join(names), *rows]).encode()
+
+
+def refusal(content, name, **options):
+    with pytest.raises(DemonstrationError) as caught:
+        read_demonstrations(content, name, **options)
+    message = str(caught.value)
+    assert "\n" not in message and ": found " in message and "; accepted: " in message
+    return message
+
+
+def assert_turns(demonstration, turns, atol=1e-12):
+    assert demonstration.orientations is not None
+    np.testing.assert_allclose(demonstration.orientations, turns, atol=atol)
+
+
+def assert_same(demonstration, positions, times=TIMES):
+    np.testing.assert_allclose(demonstration.positions, positions, rtol=1e-12)
+    np.testing.assert_allclose(demonstration.times, times - times[0], rtol=1e-9, atol=1e-9)
+
+
+class TestText:
+    @pytest.mark.parametrize(
+        "header",
+        [
+            "x,y,z",
+            "t,x,y,z",
+            "timestamp,pos_x,pos_y,pos_z,qx,qy,qz,qw",
+            "time (s);tool0 x;tool0 y;tool0 z",
+            "Time\tTCP_X\tTCP_Y\tTCP_Z",
+            "# t x y z",
+            "elapsed,ee_x,ee_y,ee_z,ee_vx,ee_vy,ee_vz",
+            "header.stamp.sec,header.stamp.nsec,pose.position.x,pose.position.y,pose.position.z,pose.orientation.x,"
+            "pose.orientation.y,pose.orientation.z,pose.orientation.w",
+            "posX,posY,posZ,time_us",
+            "time,x [mm],y [mm],z [mm]",
+            "t,target_x,target_y,target_z,x,y,z",
+            "t,q1,q2,q3,q4,q5,q6,px,py,pz",
+        ],
+    )
+    def test_headers(self, header):
+        delimiter = next((mark for mark in "\t;," if mark in header), " ")
+        stamps = 1.7e9 + TIMES
+        path, turns = path_of(), turns_of()
+        columns = []
+        names = header.removeprefix("# ").split(delimiter)
+        for name in names:
+            role = role_of(name)
+            if name.endswith("nsec"):
+                columns.append(np.round(1e9 * (stamps % 1)))
+            elif name.endswith(".sec"):
+                columns.append(np.floor(stamps))
+            elif role and role.kind == "time":
+                columns.append(TIMES * (1e6 if "us" in name else 1.0))
+            elif role and role.kind == "position" and role.rank < 4:
+                columns.append(path[:, "xyz".index(role.part)] * (1e3 if "mm" in name else 1.0))
+            elif role and role.kind == "orientation":
+                columns.append(turns[:, "xyzw".index(role.part)])
+            else:
+                columns.append(RNG.normal(size=60))
+        (read,) = read_demonstrations(
+            table(header.split(delimiter) if header[0] != "#" else ["# t", "x", "y", "z"], columns, delimiter),
+            "take.csv",
+            rate=50 if header == "x,y,z" else None,
+        )
+        np.testing.assert_allclose(read.positions, path, rtol=1e-12)
+        np.testing.assert_allclose(read.times, TIMES, atol=1e-6)
+        assert (read.orientations is not None) == ("w" in header)
+        if read.orientations is not None:
+            assert_turns(read, wxyz(turns))
+
+    @given(
+        st.sampled_from(["t", "time", "timestamp", "Stamp", "elapsed"]),
+        st.sampled_from(["", "_s", "_ms", " [us]", "_ns"]),
+        st.sampled_from(["{}", "pos_{}", "position.{}", "tool0 {}", "field.pose.position.{}", "P{}", "{}_tcp"]),
+        st.sampled_from(["", "_mm", " (m)", " [cm]"]),
+        st.permutations(range(6)),
+        st.sampled_from([",", ";", "\t"]),
+    )
+    def test_names_order_units_and_delimiters_do_not_matter(self, clock, time_unit, places, unit, order, delimiter):
+        seconds = {"_ms": 1e-3, " [us]": 1e-6, "_ns": 1e-9}.get(time_unit, 1.0)
+        metres = {"_mm": 1e-3, " [cm]": 1e-2}.get(unit, 1.0)
+        path = path_of()
+        names = [clock + time_unit, *(places.format(axis) + unit for axis in "xyz"), "force_x", "note"]
+        columns = [TIMES / seconds, *(path / metres).T, RNG.normal(size=60), RNG.normal(size=60)]
+        content = table([names[k] for k in order], [columns[k] for k in order], delimiter)
+        (read,) = read_demonstrations(content, "take.csv")
+        assert_same(read, path)
+
+    def test_units_are_recognised_said_and_given(self, caplog):
+        path = path_of()
+        content = table(["t", "x", "y", "z"], [1e3 * (5 + TIMES), *(1e3 * path).T])
+        assert_same(read_demonstrations(content, "a.csv", unit="mm,ms")[0], path)
+        assert not caplog.messages
+        with caplog.at_level("WARNING"):
+            (read,) = read_demonstrations(content, "a.csv")
+        assert_same(read, path)
+        assert caplog.messages == ["a.csv: taken as in mm and ms by its size; unit=… says otherwise"]
+        assert "unit: found 'miles'; accepted: m, cm, mm" in refusal(content, "a.csv", unit="miles")
+
+    @pytest.mark.parametrize(("rate", "unit"), [(5, "ms"), (100, "ms"), (1000, "us"), (30, "ns"), (1000, "ns")])
+    def test_units_of_times_are_those_that_make_a_rate(self, rate, unit):
+        times, size = np.arange(600) / rate, {"ms": 1e3, "us": 1e6, "ns": 1e9}[unit]
+        content = table(["t", "x", "y", "z"], [times * size, *path_of(num=600).T])
+        np.testing.assert_allclose(read_demonstrations(content, "a.csv")[0].times, times, rtol=1e-9)
+
+    def test_takes_are_told_apart_by_label_and_by_times_that_begin_again(self):
+        paths = [path_of(k) for k in range(3)]
+        clock, places = np.tile(TIMES, 3), np.concatenate(paths)
+        for names, columns in (
+            (["t", "x", "y", "z"], [clock, *places.T]),
+            (["t", "x", "y", "z", "trial"], [clock, *places.T, np.repeat(np.arange(3), 60)]),
+            (["t", "x", "y", "z", "episode_index"], [np.arange(180) / 50, *places.T, np.repeat(np.arange(3), 60)]),
+        ):
+            read = read_demonstrations(table(names, columns), "takes.csv")
+            assert len(read) == 3
+            for demonstration, path in zip(read, paths, strict=True):
+                assert_same(demonstration, path)
+
+    def test_tables_without_header(self):
+        path, turns = path_of(), turns_of()
+        for columns, rate in (([TIMES, path], None), ([path], 50), ([TIMES, path, turns], None), ([path, turns], 50)):
+            rows = np.column_stack(columns)
+            for delimiter in (" ", ",", "\t", ";"):
+                text = "\n".join(delimiter.join(map(repr, row)) for row in rows.tolist()).encode()
+                (read,) = read_demonstrations(text, "take.txt", rate=rate)
+                assert_same(read, path)
+                assert (read.orientations is None) == (rows.shape[1] < 7)
+        (flat,) = read_demonstrations(
+            "\n".join(f"{t} {x} {y}" for t, (x, y, _) in zip(TIMES, path, strict=True)).encode(), "a.txt"
+        )
+        assert_same(flat, path[:, :2])
+
+    def test_decimal_commas(self):
+        text = table(["t", "x", "y", "z"], [TIMES, *path_of().T], ";").replace(b".", b",")
+        assert_same(read_demonstrations(text, "a.csv")[0], path_of())
+
+    def test_what_is_not_clear_is_asked_for(self):
+        path = path_of()
+        content = table(["left_x", "left_y", "right_x", "right_y"], [*path[:, :2].T, *path[:, :2].T])
+        assert "2 places (left, right)" in refusal(content, "a.csv")
+        columns = {"x": "right_x", "y": "right_y"}
+        assert_same(read_demonstrations(content, "a.csv", columns=columns, rate=50)[0], path[:, :2])
+        content = table(["a", "b", "c"], path.T)
+        assert "'a,b,c'" in refusal(content, "a.csv")
+        assert_same(read_demonstrations(content, "a.csv", columns="x,y,z", rate=50)[0], path)
+        assert "no 'd' in" in refusal(content, "a.csv", columns={"x": "d", "y": "b"})
+        assert "2 names for 3 columns" in refusal(content, "a.csv", columns="x,y")
+        content = table(["1", "2", "3", "4", "5"], RNG.normal(size=(5, 9)))
+        assert "5 columns without names" in refusal(content, "a.csv")
+
+    def test_the_issues_bad_tables_are_refused_in_one_line(self):
+        good = table(["t", "x", "y"], [TIMES, *path_of()[:, :2].T]).decode().splitlines()
+        for text, words in (
+            (good[:2], "1 sample"),
+            ([*good[:5], good[4], *good[5:]], "times that increase"),
+            ([*good[:5], good[3], *good[5:]], "at line 6"),
+            ([*good[:5], "0.1,nan,0", *good[5:]], "nan at line 6"),
+            ([*good[:5], "0.07,0", *good[5:]], "line 6: found 2 columns"),
+            ([*good[:5], "0.07,0,1,2", *good[5:]], "line 6: found 4 columns"),
+        ):
+            assert words in refusal("\n".join(text).encode(), "a.csv")
+
+
+class TestArrays:
+    def test_npy(self, tmp_path):
+        np.save(tmp_path / "one.npy", path_of())
+        np.save(tmp_path / "timed.npy", np.column_stack([TIMES, path_of()]))
+        np.save(tmp_path / "poses.npy", np.column_stack([path_of(), turns_of()]))
+        fields = np.array([(t, *p) for t, p in zip(TIMES, path_of(), strict=True)], [(n, "f8") for n in ("t", *"xyz")])
+        np.save(tmp_path / "named.npy", fields)
+        for path in tmp_path.iterdir():
+            timed = path.stem in ("timed", "named")
+            (read,) = load_demonstrations(path, rate=None if timed else 50)
+            assert_same(read, path_of())
+            assert read.name == path.stem
+        np.save(tmp_path / "many.npy", np.stack([path_of(k) for k in range(4)]))
+        read = load_demonstrations(tmp_path / "many.npy", rate=50)
+        assert [d.name for d in read] == [f"many {k}" for k in range(4)]
+        assert_same(read[3], path_of(3))
+
+    def test_objects_are_never_unpickled_and_the_message_says_what_to_do(self, tmp_path):
+        ragged = np.empty(2, dtype=object)
+        ragged[:] = [path_of(num=20), path_of(num=30)]
+        np.save(tmp_path / "a.npy", ragged, allow_pickle=True)
+        message = refusal((tmp_path / "a.npy").read_bytes(), "a.npy")
+        assert "never unpickled" in message and "np.savez(path, *takes)" in message
+        np.savez(tmp_path / "a.npz", ragged=ragged)
+        assert "never opened" in refusal((tmp_path / "a.npz").read_bytes(), "a.npz")
+        np.savez(tmp_path / "b.npz", *ragged)
+        assert [len(d.times) for d in load_demonstrations(tmp_path / "b.npz")] == [20, 30]
+
+    @pytest.mark.parametrize(
+        "arrays",
+        [
+            {"time": TIMES, "pos": path_of()},
+            {"t": TIMES, "x": path_of()},
+            {"t": TIMES[:, None], "positions": path_of().T},
+            {"timestamps": 1e3 * TIMES, "ee_pos": 1e3 * path_of(), "ee_quat": turns_of(), "velocities": path_of(1)},
+            {
+                "stamp_ns": (1e9 * TIMES).astype(np.int64),
+                "x": path_of()[:, 0],
+                "y": path_of()[:, 1],
+                "z": path_of()[:, 2],
+            },
+            {"positions": path_of(), "rate": 50.0},
+            {"positions": path_of()[None], "times": TIMES},
+            {"trajectory": path_of(), "dt": 0.02},
+        ],
+    )
+    @pytest.mark.parametrize("suffix", ["npz", "mat", "json"])
+    def test_named_arrays(self, tmp_path, arrays, suffix):
+        path = tmp_path / f"take.{suffix}"
+        if suffix == "npz":
+            np.savez(path, **arrays)
+        elif suffix == "mat":
+            scipy.io.savemat(path, {"run": arrays} if "pos" in arrays else arrays)
+        else:
+            path.write_text(json.dumps({key: np.asarray(value).tolist() for key, value in arrays.items()}))
+        (read,) = load_demonstrations(path, unit="ms,mm" if "timestamps" in arrays else None)
+        assert_same(read, path_of())
+        if "ee_quat" in arrays:
+            assert_turns(read, wxyz(turns_of()))
+
+    def test_several_takes_of_named_arrays(self, tmp_path):
+        takes = {f"take_{k}": path_of(k, 40 + k) for k in range(3)}
+        np.savez(tmp_path / "a.npz", **takes)  # pyright: ignore[reportArgumentType]
+        scipy.io.savemat(tmp_path / "b.mat", takes)
+        records = [
+            {"name": f"take_{k}", "times": np.arange(40 + k) / 50, "positions": takes[f"take_{k}"]} for k in range(3)
+        ]
+        plain = [{key: np.asarray(value).tolist() for key, value in record.items()} for record in records]
+        (tmp_path / "c.json").write_text(json.dumps({"demonstrations": plain}))
+        (tmp_path / "d.json").write_text(json.dumps({take["name"]: take for take in plain}))
+        cells = np.empty(3, dtype=object)
+        cells[:] = [{"time": record["times"], "pos": record["positions"].T} for record in records]
+        scipy.io.savemat(tmp_path / "e.mat", {"takes": cells})
+        for path in sorted(tmp_path.iterdir()):
+            read = load_demonstrations(path, rate=50 if path.stem in "ab" else None)
+            assert len(read) == 3
+            for k, demonstration in enumerate(read):
+                assert_same(demonstration, takes[f"take_{k}"], np.arange(40 + k) / 50)
+
+    @pytest.mark.parametrize("nested", [False, True])
+    def test_json_records(self, nested):
+        def record(t, x, y, z):
+            if not nested:
+                return {"t": t, "position": [x, y, z]}
+            stamp = {"sec": 1700000000 + int(t), "nanosec": round(t % 1 * 1e9)}
+            return {"stamp": stamp, "pose": {"position": {"x": x, "y": y, "z": z}}}
+
+        records = [record(*row) for row in np.column_stack([TIMES, path_of()]).tolist()]
+        (read,) = read_demonstrations(json.dumps(records).encode(), "a.json")
+        np.testing.assert_allclose(read.positions, path_of())
+        np.testing.assert_allclose(read.times, TIMES, atol=1e-6)
+
+    def test_json_lists(self):
+        (read,) = read_demonstrations(json.dumps(path_of().tolist()).encode(), "a.json", rate=50)
+        assert_same(read, path_of())
+        ragged = [path_of(k, 30 + k).tolist() for k in range(3)]
+        assert [len(d.times) for d in read_demonstrations(json.dumps(ragged).encode(), "a.json")] == [30, 31, 32]
+        assert "the same fields in all samples" in refusal(b'[{"t":0,"x":1,"y":2},{"t":1,"x":1}]', "a.json")
+
+    def test_the_files_own_npz_keeps_metres_and_orientations(self, tmp_path):
+        saved = Demonstration(TIMES, 200 * path_of() % 90, "a", wxyz(turns_of()))
+        save_demonstrations(tmp_path / "a.npz", [saved])
+        (read,) = load_demonstrations(tmp_path / "a.npz")
+        assert_same(read, saved.positions)
+        assert_turns(read, saved.orientations)
+
+
+class TestOrientations:
+    @pytest.mark.parametrize("name", ["ori_wxyz", "quat", "orientation_xyzw"])
+    def test_order_is_by_name_and_signs_do_not_jump(self, tmp_path, name):
+        turns = wxyz(turns_of()) if name == "ori_wxyz" else turns_of()
+        np.savez(
+            tmp_path / "a.npz", t=TIMES, pos=path_of(), **{name: turns * np.where(np.arange(60) % 2, -1, 1)[:, None]}
+        )
+        (read,) = load_demonstrations(tmp_path / "a.npz")
+        assert_turns(read, wxyz(turns_of()))
+        assert read.orientations is not None and not read.orientations.flags.writeable
+
+
+class Planar:
+    """Kinematics of two links of 0.4 m in a plane."""
+
+    joint_names = ("shoulder", "elbow")
+
+    def end_effector(self, q):
+        angles = np.cumsum(q, axis=-1)
+        return np.stack([0.4 * np.cos(angles).sum(-1), 0.4 * np.sin(angles).sum(-1), 0 * angles[..., 0]], axis=-1)
+
+
+class TestJoints:
+    Q = np.column_stack([np.linspace(0, 1, 60), np.linspace(1, -0.5, 60)])
+
+    @pytest.mark.parametrize(
+        ("names", "order", "size"),
+        [
+            (["q1", "q2"], [0, 1], 1.0),
+            (["joint_elbow", "joint_shoulder"], [0, 1], 1.0),
+            (["joint.elbow", "joint.shoulder"], [1, 0], 1.0),
+            (["J1_deg", "J2_deg"], [0, 1], 180 / np.pi),
+            (["position0", "position1"], [0, 1], 1.0),
+            (["joint_positions[0]", "joint_positions[1]"], [0, 1], 1.0),
+        ],
+    )
+    def test_angles_become_places_of_the_hand_by_the_arm(self, names, order, size):
+        content = table(["t", *names], [TIMES, *(size * self.Q[:, order]).T])
+        (read,) = read_demonstrations(content, "a.csv", arm=Planar())
+        assert_same(read, Planar().end_effector(self.Q))
+        message = refusal(content, "a.csv")
+        assert "angles of 2 joints" in message and "arm=…" in message
+
+    def test_degrees_are_recognised_and_a_gripper_is_left_out(self, tmp_path):
+        np.savez(tmp_path / "a.npz", t=TIMES, qpos=np.column_stack([180 / np.pi * self.Q, np.full(60, 30)]))
+        assert_same(load_demonstrations(tmp_path / "a.npz", arm=Planar())[0], Planar().end_effector(self.Q))
+
+    def test_arrays_as_wide_as_the_arm_are_its_angles(self, tmp_path):
+        class Long(Planar):
+            joint_names = tuple("abcdefg")
+
+        q = RNG.uniform(-1, 1, (60, 7))
+        np.save(tmp_path / "a.npy", q)
+        assert_same(load_demonstrations(tmp_path / "a.npy", rate=50, arm=Long())[0], Long().end_effector(q))
+        with pytest.raises(DemonstrationError, match="7 columns without names"):
+            load_demonstrations(tmp_path / "a.npy")
+
+    def test_other_numbers_of_joints_and_two_kinds_in_one_folder_are_refused(self, tmp_path):
+        (tmp_path / "a.csv").write_bytes(table(["t", "x", "y", "z"], [TIMES, *path_of().T]))
+        (tmp_path / "b.csv").write_bytes(table(["t", *(f"q{k}" for k in range(5))], [TIMES, *RNG.normal(size=(5, 60))]))
+        with pytest.raises(DemonstrationError, match=r"joint angles in 'b' but places of the hand in 'a'"):
+            load_demonstrations(tmp_path)
+        with pytest.raises(DemonstrationError, match=r"b\.csv.*angles of 5 joints.*the arm's 2 \(shoulder, elbow\)"):
+            load_demonstrations(tmp_path / "b.csv", arm=Planar())
+
+
+def lerobot(folder, names):
+    """A LeRobot data set of two episodes."""
+    pa, pq = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    (folder / "meta").mkdir(parents=True)
+    (folder / "data" / "chunk-000").mkdir(parents=True)
+    state = {"dtype": "float32", "shape": [3], "names": names}
+    (folder / "meta" / "info.json").write_text(json.dumps({"fps": 50, "features": {"observation.state": state}}))
+    for k in range(2):
+        values = path_of(k).astype(np.float32)
+        columns = {
+            "observation.state": pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), 3),
+            "action": pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), 3),
+            "timestamp": TIMES.astype(np.float32),
+            "frame_index": np.arange(60),
+            "episode_index": np.full(60, k),
+            "task": ["pour"] * 60,
+        }
+        pq.write_table(pa.table(columns), folder / "data" / "chunk-000" / f"episode_{k:06}.parquet")
+
+
+class TestParquet:
+    def test_a_table(self, tmp_path):
+        pa, pq = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+        columns = {
+            "time": TIMES,
+            **{f"ee_pos_{axis}": path_of()[:, k] for k, axis in enumerate("xyz")},
+            "note": ["a"] * 60,
+        }
+        pq.write_table(pa.table(columns), tmp_path / "a.parquet")
+        assert_same(load_demonstrations(tmp_path / "a.parquet")[0], path_of())
+
+    def test_a_lerobot_data_set(self, tmp_path):
+        lerobot(tmp_path / "places", ["x", "y", "z"])
+        read = load_demonstrations(tmp_path / "places")
+        assert [d.name for d in read] == ["0", "1"]
+        np.testing.assert_allclose(read[1].positions, path_of(1), rtol=1e-6)
+        np.testing.assert_allclose(read[1].times, TIMES, atol=1e-6)
+        lerobot(tmp_path / "angles", {"motors": ["shoulder.pos", "elbow.pos", "gripper.pos"]})
+        read = load_demonstrations(tmp_path / "angles", arm=Planar())
+        np.testing.assert_allclose(read[0].positions, Planar().end_effector(path_of()[:, :2]), atol=1e-6)
+        with pytest.raises(DemonstrationError, match=r"angles of 2 joints \(observation"):
+            load_demonstrations(tmp_path / "angles")
+        file = next((tmp_path / "angles").rglob("*.parquet"))
+        np.testing.assert_allclose(load_demonstrations(file, arm=Planar())[0].duration, TIMES[-1], rtol=1e-6)
+
+
+def robomimic(path):
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(path, "w") as file:
+        data = file.create_group("data")
+        data.attrs["env_args"] = json.dumps({"env_kwargs": {"control_freq": 50}})
+        for k in (0, 1, 10):
+            obs = data.create_group(f"demo_{k}/obs")
+            obs["robot0_eef_pos"], obs["robot0_eef_quat"] = path_of(k), turns_of()
+            obs["robot0_joint_pos"], obs["robot0_gripper_qpos"] = RNG.normal(size=(60, 7)), np.zeros((60, 2))
+            obs["object"], obs["agentview_image"] = np.zeros((60, 10)), np.zeros((60, 8, 8, 3), np.uint8)
+            data[f"demo_{k}/actions"], data[f"demo_{k}/dones"] = np.zeros((60, 7)), np.zeros(60, int)
+        file["mask/train"] = np.array([b"demo_0", b"demo_1"])
+
+
+class TestHdf5:
+    def test_robomimic(self, tmp_path):
+        robomimic(tmp_path / "low_dim.hdf5")
+        read = load_demonstrations(tmp_path / "low_dim.hdf5")
+        assert [d.name for d in read] == ["demo_0", "demo_1", "demo_10"]
+        assert_same(read[2], path_of(10))
+        assert_turns(read[2], wxyz(turns_of()))
+
+    def test_plain_arrays(self, tmp_path):
+        h5py = pytest.importorskip("h5py")
+        with h5py.File(tmp_path / "a.h5", "w") as file:
+            file["time"], file["positions"] = TIMES, path_of()
+        assert_same(load_demonstrations(tmp_path / "a.h5")[0], path_of())
+
+
+NANOSECONDS = 1_700_000_000 * 10**9 + (TIMES * 1e9).round().astype(np.int64)
+
+
+def bag(path, topics):
+    """Write a bag: for each topic, its type and what makes a message of a sample's number and of the types."""
+    pytest.importorskip("rosbags")
+    from rosbags.rosbag1 import Writer as Writer1
+    from rosbags.rosbag2 import StoragePlugin
+    from rosbags.rosbag2 import Writer as Writer2
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    first = path.suffix == ".bag"
+    store = get_typestore(Stores.ROS1_NOETIC if first else Stores.ROS2_HUMBLE)
+    if first:
+        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+    plugin = StoragePlugin.MCAP if path.suffix == ".mcap" else StoragePlugin.SQLITE3
+    folder = path.with_suffix("")
+    with Writer1(path) if first else Writer2(folder, version=9, storage_plugin=plugin) as writer:
+        for topic, (kind, make) in topics.items():
+            connection = writer.add_connection(topic, kind, typestore=store)
+            for k in range(len(TIMES)):
+                message = make(k, store.types)
+                data = (store.serialize_ros1 if first else store.serialize_cdr)(message, kind)
+                writer.write(connection, int(NANOSECONDS[k]) + 10**9, data)
+    return path if first else next(folder.glob(f"*{path.suffix}"))
+
+
+def header(k, types):
+    stamp = types["builtin_interfaces/msg/Time"](int(NANOSECONDS[k] // 10**9), int(NANOSECONDS[k] % 10**9))
+    fields = {"stamp": stamp, "frame_id": "base"}
+    kind = types["std_msgs/msg/Header"]
+    return kind(**fields, seq=k) if "seq" in kind.__dataclass_fields__ else kind(**fields)
+
+
+def pose(k, types, part="Pose", places=("position", "orientation"), point="Point"):
+    vector, turn = (
+        types[f"geometry_msgs/msg/{point}"](*path_of()[k]),
+        types["geometry_msgs/msg/Quaternion"](*turns_of()[k]),
+    )
+    return types[f"geometry_msgs/msg/{part}"](**dict(zip(places, (vector, turn), strict=True)))
+
+
+def pose_stamped(k, types):
+    return types["geometry_msgs/msg/PoseStamped"](header(k, types), pose(k, types))
+
+
+def transforms(k, types):
+    moving = pose(k, types, "Transform", ("translation", "rotation"), "Vector3")
+    fixed = pose(0, types, "Transform", ("translation", "rotation"), "Vector3")
+    stamped = types["geometry_msgs/msg/TransformStamped"]
+    return types["tf2_msgs/msg/TFMessage"](
+        [stamped(header(k, types), "camera", fixed), stamped(header(k, types), "tool0", moving)]
+    )
+
+
+def joint_state(k, types):
+    q = TestJoints.Q[k, ::-1].copy()
+    return types["sensor_msgs/msg/JointState"](header(k, types), ["elbow", "shoulder"], q, np.zeros(2), np.zeros(2))
+
+
+POSE = {"/ee": ("geometry_msgs/msg/PoseStamped", pose_stamped)}
+TF = {"/tf": ("tf2_msgs/msg/TFMessage", transforms)}
+STATES = {"/joint_states": ("sensor_msgs/msg/JointState", joint_state)}
+TEXTS = {"/log": ("std_msgs/msg/String", lambda k, types: types["std_msgs/msg/String"]("hello"))}
+
+
+class TestBags:
+    @pytest.mark.parametrize("suffix", [".mcap", ".db3", ".bag"])
+    @pytest.mark.parametrize(
+        "topics",
+        [POSE | TF | STATES | TEXTS, {"/p": ("geometry_msgs/msg/Pose", pose)}, TF],
+        ids=["PoseStamped", "Pose", "TFMessage"],
+    )
+    def test_poses(self, tmp_path, suffix, topics):
+        path = bag(tmp_path / f"take{suffix}", topics)
+        for read in (load_demonstrations(path), read_demonstrations(path.read_bytes(), f"take{suffix}")):
+            assert len(read) == 1
+            assert_same(read[0], path_of())
+            assert_turns(read[0], wxyz(turns_of()))
+        if suffix != ".bag":
+            assert_same(load_demonstrations(path.parent)[0], path_of())
+
+    @pytest.mark.parametrize("suffix", [".mcap", ".db3", ".bag"])
+    def test_joint_states_become_places_by_the_arm(self, tmp_path, suffix):
+        path = bag(tmp_path / f"take{suffix}", STATES | TEXTS)
+        assert_same(load_demonstrations(path, arm=Planar())[0], Planar().end_effector(TestJoints.Q))
+        with pytest.raises(DemonstrationError, match=r"angles of 2 joints \(elbow, shoulder\)"):
+            load_demonstrations(path)
+
+    def test_topics_are_listed_where_none_or_several_have_poses(self, tmp_path):
+        path = bag(tmp_path / "none.mcap", TEXTS)
+        with pytest.raises(DemonstrationError, match=r"no poses among the topics /log \(String\)"):
+            load_demonstrations(path)
+        path = bag(tmp_path / "two.mcap", POSE | {"/wanted": POSE["/ee"]} | TF)
+        with pytest.raises(DemonstrationError, match=r"/ee \(PoseStamped\), /wanted \(PoseStamped\).*topic="):
+            load_demonstrations(path)
+        assert_same(load_demonstrations(path, topic="/wanted")[0], path_of())
+        assert_same(load_demonstrations(path, topic="tool0")[0], path_of())
+        with pytest.raises(DemonstrationError, match="frames camera, tool0"):
+            load_demonstrations(path, topic="nowhere")
+
+
+class TestFolders:
+    def test_files_of_all_kinds_are_read_together(self, tmp_path):
+        (tmp_path / "a.csv").write_bytes(table(["t", "x", "y", "z"], [TIMES, *path_of().T]))
+        np.savez(tmp_path / "b.npz", t=TIMES, pos=path_of(1))
+        (tmp_path / "c.json").write_text("{}")
+        (tmp_path / "notes.txt").write_text("ours")
+        scipy.io.savemat(tmp_path / "d.mat", {"t": TIMES, "pos": path_of(2).T})
+        read = load_demonstrations(tmp_path)
+        assert [d.name for d in read] == ["a", "b", "d"]
+        assert_same(read[2], path_of(2))
+        assert len(load_demonstrations([tmp_path / "a.csv", str(tmp_path)])) == 4
+        with pytest.raises(DemonstrationError, match="found none"):
+            load_demonstrations([])
+
+    def test_units_are_recognised_over_all_files_and_said_once(self, tmp_path, caplog):
+        for k, size in enumerate((1, 10, 20)):  # the first alone might be metres
+            (tmp_path / f"{k}.csv").write_bytes(
+                table(["t", "x", "y", "z", "n"], [TIMES, *(10 * size * path_of()).T, TIMES])
+            )
+        read = load_demonstrations(tmp_path)
+        assert_same(read[0], 0.01 * path_of())
+        assert caplog.messages == [
+            f"{tmp_path / '0.csv'} and 2 more: columns n are not used",
+            f"{tmp_path}: taken as in mm by its size; unit=… says otherwise",
+        ]
+
+
+@pytest.mark.parametrize(
+    ("suffix", "module", "extra"),
+    [(".parquet", "pyarrow.parquet", "parquet"), (".h5", "h5py", "hdf5"), (".mcap", "rosbags.highlevel", "ros")],
+)
+def test_a_missing_reader_is_one_line_that_names_the_extra(monkeypatch, suffix, module, extra):
+    monkeypatch.setitem(sys.modules, module, None)
+    assert f"pip install 'dt-viz[{extra}]'" in refusal(b"PAR1", f"a{suffix}")
+
+
+def test_a_gigabyte_is_refused_by_its_size(tmp_path):
+    for suffix in READERS:
+        path = tmp_path / f"a{suffix}"
+        with path.open("wb") as file:
+            file.truncate(10**9)
+        with pytest.raises(DemonstrationError, match=r"found 1000\.0 MB; accepted: at most"):
+            load_demonstrations(path)
+        path.unlink()
+
+
+def good_files(folder):
+    """A file of each kind."""
+    np.savez(folder / "a.npz", times=TIMES, positions=path_of())
+    np.save(folder / "a.npy", path_of())
+    scipy.io.savemat(folder / "a.mat", {"t": TIMES, "pos": path_of().T})
+    (folder / "a.json").write_text(
+        json.dumps([{"t": t, "pos": p} for t, p in zip(TIMES.tolist(), path_of().tolist(), strict=True)])
+    )
+    for suffix in (".csv", ".tsv", ".txt", ".dat"):
+        (folder / f"a{suffix}").write_bytes(table(["t", "x", "y", "z"], [TIMES, *path_of().T]))
+    with suppress(pytest.skip.Exception):
+        robomimic(folder / "a.hdf5")
+        (folder / "a.h5").write_bytes((folder / "a.hdf5").read_bytes())
+    with suppress(pytest.skip.Exception):
+        lerobot(folder / "lerobot", ["x", "y", "z"])
+        next((folder / "lerobot").rglob("*.parquet")).rename(folder / "a.parquet")
+    with suppress(pytest.skip.Exception):
+        for suffix in (".mcap", ".db3", ".bag"):
+            bag(folder / f"bag{suffix[1:]}{suffix}", POSE).rename(folder / f"a{suffix}")
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("good")
+    good_files(folder)
+    return folder
+
+
+@pytest.mark.parametrize("suffix", [suffix for suffix in READERS if suffix not in (".tsv", ".txt", ".dat", ".h5")])
+def test_mutated_files_are_read_or_refused(files, suffix):
+    if not (path := files / f"a{suffix}").exists():
+        pytest.skip(f"nothing writes {suffix} here")
+    content, rng = path.read_bytes(), np.random.default_rng(len(suffix))
+    assert len(read_demonstrations(content, path, arm=Planar())) > 0
+    for k in range(300):
+        changed = bytearray(content[: int(rng.integers(len(content)))] if k % 3 == 0 else content)
+        for place in rng.integers(len(changed), size=rng.integers(1, 9)) if changed else ():
+            changed[place] = int(rng.integers(256))
+        try:
+            read = read_demonstrations(bytes(changed), path, arm=Planar())
+        except DemonstrationError as error:
+            assert len(str(error)) < 1000 and "\n" not in str(error)
+        else:
+            for demonstration in read:
+                assert np.isfinite(demonstration.positions).all() and (np.diff(demonstration.times) > 0).all()
