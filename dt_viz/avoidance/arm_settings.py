@@ -29,7 +29,7 @@ class WholeArmSettings:
     """Damping λ of the contact's pseudo-inverse, m/rad: contacts that joints can hardly move are not chased."""
     hand_weight: float = scales(100.0, -2)
     """Weight of the end effector's motion, rad²/m²: a contact of the forearm is resolved with the hand at rest."""
-    pin: float = scales(0.03)
+    pin: float = scales(0.02)
     """Size of the region around a pinned posture in which the field fades out, metres by `Robot.levers`."""
     speed: float = scales(0.2)
     """Distance that a contact at full strength escapes in a unit of flow time, metres."""

@@ -353,9 +353,10 @@ def records(parts: tuple[Obstacle, ...]) -> tuple[Shapes, Values]:
     grids = tuple(dict.fromkeys(part.grid for part in parts if part.grid is not None))
     begins = dict(zip(grids, np.cumsum([0, *(grid.values.size for grid in grids)]).tolist(), strict=False))
     for shape, part in zip(shapes, parts, strict=True):
-        fields = {"position": part.position, "axes": rotation(part.wxyz), "begin": begins.get(part.grid, 0)}
-        for name, value in {**part.record, **fields}.items():
+        for name, value in {**part.record, "position": part.position, "axes": rotation(part.wxyz)}.items():
             shape[name] = value
+        if part.grid is not None:
+            shape["begin"] = begins[part.grid]
     return shapes, _joined(grids)
 
 
