@@ -123,10 +123,10 @@ def read_text(file: BinaryIO, source: Path, options: ReadOptions) -> Iterator[Ta
     used = [k for k in range(width) if wanted[k] and (label[k] or _is_number(first[k], delimiter))]
     max_rows = LIMITS.numbers // max(len(used), 1)
     fields = [(f"f{k}", "f8" if k in used else "U1") for k in range(width)]
-    converters = {k: lambda cell: labels.setdefault(cell.strip(), len(labels)) for k in used if label[k]}
-    lines = (line for _, line in itertools.islice(_rows(file, skipped, delimiter), max_rows + 1))
+    converters: Any = {k: lambda cell: labels.setdefault(cell.strip(), len(labels)) for k in used if label[k]}
+    lines: Any = (line for _, line in itertools.islice(_rows(file, skipped, delimiter), max_rows + 1))
     try:
-        rows = np.loadtxt(  # pyright: ignore[reportCallIssue]  # its stubs know no types by field
+        rows = np.loadtxt(
             lines,
             dtype=np.dtype(fields),
             delimiter=delimiter,
