@@ -31,8 +31,8 @@ from dt_viz.robot.choices import (
 from dt_viz.robot.collision import CollisionModel
 from dt_viz.robot.cover import CoverSettings, covering_tree, protrusion, thickness
 from dt_viz.robot.kinematics import Kinematics
-from dt_viz.robot.link_shapes import Shapes, constant, read_shapes, reduced
-from dt_viz.robot.meshes import LinkMesh
+from dt_viz.robot.link_shapes import Shapes, read_shapes, reduced
+from dt_viz.robot.meshes import LinkMesh, constant
 from dt_viz.robot.robot import Robot
 from dt_viz.robot.tool_chain import ArmChain, find_chain
 from dt_viz.robot.urdf import ArmError, read_description, read_semantic
@@ -179,7 +179,7 @@ def _load_described(name: str, progress: Progress | None) -> Robot:
     """Load an arm that the package robot_descriptions knows and has downloaded."""
     accepted = f"{', '.join(ARMS)}; or a name of the package robot_descriptions"
     try:
-        cache = importlib.import_module("robot_descriptions._cache")
+        cache: Any = importlib.import_module("robot_descriptions._cache")
         repositories = importlib.import_module("robot_descriptions._repositories").REPOSITORIES
     except ImportError as error:
         raise ArmError("arm", "name", repr(name), f"{accepted}: pip install robot_descriptions") from error

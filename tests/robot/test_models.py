@@ -1,5 +1,8 @@
 """Arms by name and from files: what is found of them holds, is kept, and two are there at once."""
 
+# pyright: reportAttributeAccessIssue=false
+# (coal has no stubs)
+
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -133,8 +136,15 @@ def test_tasks_are_placed_where_the_arm_follows_them(name, task):
     assert 0.4 * robot.size < placement.scale <= robot.size + 1e-12
     moved = placement(np.array([path[np.linspace(0, len(path) - 1, 60).astype(int)] for path in paths]))
     assert follows(robot, moved, PlacementSettings(error=1e-3))
-    with pytest.raises(UnreachableError, match=r"the largest scale that fits is about"):
-        place(robot, paths, scale=2.5 * robot.size)
+
+
+def test_a_task_that_is_too_large_is_refused_with_the_scale_that_fits():
+    robot, paths = load_arm("so100"), TASKS["push_box"]().paths
+    settings = PlacementSettings(scales=(1.0, 0.4), ahead=(0.0,), up=(0.0,))
+    with pytest.raises(UnreachableError, match=r"SO-100 .* at the scale 1\.04.*: the largest scale .* is about 0\.42"):
+        place(robot, paths, 2.5 * robot.size, settings)
+    with pytest.raises(UnreachableError, match="anywhere ahead of it"):
+        place(robot, paths, 20.0, settings)
 
 
 def test_the_jaco_has_its_tasks_where_they_are():
@@ -204,6 +214,7 @@ def test_two_arms_are_there_at_once_and_each_is_loaded_once():
 
 
 def test_what_was_chosen_is_said_with_reasons():
+    report = load_arm("xarm7").report()
     words = ["xArm7: 7 joints, reach 0.82 m", "joint1, joint2", "limits of the URDF", "link_eef: its name"]
     words += [
         "by convention",
@@ -211,7 +222,7 @@ def test_what_was_chosen_is_said_with_reasons():
         "in the mean",
         "may touch",
     ]
-    assert [word for word in words if word not in load_arm("xarm7").report()] == []
+    assert [word for word in words if word not in report] == []
     assert "29 points of 2572 spheres: as shipped" in load_jaco().report()
 
 
