@@ -11,7 +11,7 @@ from dt_viz.robot.sizing import scales
 class ControllerSettings:
     """Settings of `dt_viz.control.controller.ArmController`.
 
-    What is said to scale is for an arm as large as the JACO, and scales with an arm's reach.
+    `scales` marks what is given for an arm as large as the JACO, and scales with an arm's reach.
     """
 
     acceleration: float = 4.0
@@ -95,8 +95,7 @@ class ControllerSettings:
     at_rest: float = 1e-3
     """Gap, rad, and velocity, rad/s, of joints that count as at rest."""
     aside: float = scales(5e-3)
-    """Displacement, metres by `Robot.levers`, from which on a robot at rest counts as having stepped
-    aside."""
+    """Displacement, metres by `Robot.levers`, from which on a robot at rest counts as having stepped aside."""
     touching: float = 5e-3
     """Depth of a body point in an obstacle that counts as touching, metres."""
     range_tolerance: float = 0.01

@@ -263,7 +263,8 @@ class CollisionModel:
 
         It is accurate to `link_distances.SELF_TOLERANCE`. Links that a joint connects or that may touch are left out.
         """
-        return self._search(BetweenLinks(self.links, self.touching), q, SELF_REACH)
+        measure = BetweenLinks(self.links, self.touching)
+        return self._search(measure, q, SELF_REACH) if len(measure.bodies) else None
 
     def nearest_to_table(self, q: ArrayLike) -> Nearest:
         """Find the smallest height above the table z = 0 on a path q (T, n), rad, to `link_distances.TOLERANCE`.

@@ -308,7 +308,7 @@ class BetweenLinks(Measure):
             if links[b].frame - links[a].frame > 1 and {links[a].urdf_name, links[b].urdf_name} not in touching
         ]
         self._links = links
-        self._pairs = np.array(apart)
+        self._pairs = np.array(apart, dtype=np.intp).reshape(-1, 2)
         self._centres = np.array([link.centre for link in links])
         self._radii = np.array([link.radius for link in links])
         self._frames = np.array([link.frame for link in links])

@@ -12,7 +12,7 @@ from dt_viz.robot.sizing import scales
 class TrackingSettings:
     """Settings of `dt_viz.robot.inverse_kinematics`, which compiled loops take, too.
 
-    What is said to scale is for an arm as large as the JACO, and scales with an arm's reach.
+    `scales` marks what is given for an arm as large as the JACO, and scales with an arm's reach.
     """
 
     direction_weight: float = 1.5

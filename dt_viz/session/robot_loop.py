@@ -14,6 +14,7 @@ from dt_viz.flows.fields import Array
 from dt_viz.motion.following import Follower
 from dt_viz.motion.solve import Solved
 from dt_viz.robot.inverse_kinematics import track
+from dt_viz.robot.sizing import scales, sized
 
 
 @dataclass(frozen=True)
@@ -30,8 +31,8 @@ class RoundSettings:
     """The same where it has stepped aside, seconds."""
     rest_at_start: float = 0.3
     """Time that the robot stays at a start, seconds."""
-    push_distance: float = 0.06
-    """Distance by which the hand is pushed, metres."""
+    push_distance: float = scales(0.06)
+    """Distance by which the hand is pushed, metres, for an arm as large as the JACO."""
     place_tolerance: float = 0.01
     """Distance of the hand from where it is held that is reported, metres."""
 
@@ -61,7 +62,8 @@ class LiveArm:
             follower: the arm.
             settings: None are the defaults.
         """
-        self._follower, self._settings = follower, settings or RoundSettings()
+        self._follower = follower
+        self._settings = sized(settings or RoundSettings(), follower.robot.size)
         self._changing = threading.Lock()
         self._commands: dict[str, Callable[[ArmController], None]] = {}
         """Commands for the thread that moves the robot, by what they are about; the newest of a kind counts."""

@@ -8,6 +8,7 @@ from typing import cast
 
 import numpy as np
 import pytest
+from other_arms import OTHER_ARMS
 from plans import joints_of
 
 from dt_viz.baselines.base import NotFittedError
@@ -78,6 +79,12 @@ class TestModel:
             MPNetModel.of({key: value for key, value in arrays.items() if key != name}, 6)
         with pytest.raises(NotFittedError, match=f"{name}.*found"):
             MPNetModel.of({**arrays, name: arrays[name][:-1]}, 6)
+
+    @pytest.mark.parametrize("method", [MPNet(), MPNetRRT()], ids=lambda method: method.name)
+    @pytest.mark.parametrize("arm", OTHER_ARMS)
+    def test_for_another_arm_it_says_whose_weights_they_are(self, problem, method, arm):
+        with pytest.raises(NotFittedError, match=r"^trained for the JACO only$"):
+            method.fit(replace(problem, robot=OTHER_ARMS[arm]()))
 
     def test_all_weights_that_ship_take_a_megabyte(self):
         files = list((ASSETS / "baselines").glob("*.npz"))

@@ -176,6 +176,7 @@ def test_the_last_frame_says_what_margin_the_meshes_keep(engine, fits, robot, in
     margin, scenario = 0.01, changed(initial("draw_s"), space="cspace", margin=0.01, view=View(field=False))
     frame = stage(engine, scenario, Stage.CERTIFIED)
     model, arm = load_jaco().collision, engine.solved(scenario, FINE).arm
+    assert arm is not None
     clearance = [
         model.nearest_to_obstacle(arm.p[arm.index == k], scenario.obstacle).distance for k in range(len(frame.rollouts))
     ]

@@ -70,6 +70,21 @@ class TestKinematics:
         assert np.abs(np.diff(followed.q, axis=0)).max() < 0.2
         np.testing.assert_allclose(followed.q[-1], followed.q[0], atol=1e-3)
 
+    def test_links_that_may_touch_are_not_kept_apart(self, robot):
+        names = [mesh.name for mesh in robot.meshes]
+        folded = np.array([0.0, np.pi, 0.5, 0.0, 5.7, 0.0])  # the hand in the upper arm
+        near = robot.collision.nearest_to_itself(folded[None])
+        assert near is not None and near.distance == 0 and robot.self_clearance(folded[None], 0.05) < 0
+        upper, hand = names[2], names[6:]
+        lenient = replace(robot, touching=frozenset(frozenset({upper, name}) for name in (*hand, "none of these")))
+        of_pairs = robot.body.spheres["joint"][lenient.pairs(2)]
+        assert len(lenient.pairs(2)) < len(robot.pairs(2)) and not (of_pairs == [1, 5]).all(axis=1).any()
+        left = lenient.collision.nearest_to_itself(folded[None])
+        assert left is None or set(left.links) != set(near.links)
+        every = replace(robot, touching=frozenset(frozenset({a, b}) for a in names for b in names if a != b))
+        assert every.collision.nearest_to_itself(folded[None]) is None
+        assert every.self_clearance(folded[None], 0.05) == 0.05
+
     @pytest.mark.parametrize("num", [2, 9])
     def test_an_arm_with_too_few_or_too_many_joints_is_refused(self, robot, num):
         with pytest.raises(ValueError, match=f"jaco: found {num} joints; accepted: 3 to 8"):

@@ -64,8 +64,10 @@ class Client(ProtocolClient):
 @pytest.fixture(scope="module")
 def server(fits):
     allowed = [Origin.parse("https://demo.example.org")]
-    places = {"max_sessions": NUM_PLACES, "max_waiting": MAX_WAITING}
-    server = Server(TASKS, fits, load_jaco(), task="draw_s", port=0, allowed=allowed, **places)
+    places, waiting = NUM_PLACES, MAX_WAITING
+    server = Server(
+        TASKS, fits, load_jaco(), task="draw_s", port=0, max_sessions=places, max_waiting=waiting, allowed=allowed
+    )
     yield server
     server.close()
 

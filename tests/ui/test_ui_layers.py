@@ -6,6 +6,7 @@ from typing import cast
 import numpy as np
 import pytest
 import trimesh
+from other_arms import OTHER_ARMS
 from pages import frame_of, ignored
 from scenes import avoiding, changed, frame_at
 from viser import transforms  # noqa: TID251
@@ -18,7 +19,7 @@ from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.engine import ArmMotion
 from dt_viz.session.frame import Stage
 from dt_viz.ui.scene.arm import NUM_ARMS, SEEN, ArmPicture, Arms, ArmSequence, arms_along
-from dt_viz.ui.scene.links import CELL, bodies, simplified
+from dt_viz.ui.scene.links import CELL, bodies, light_links, simplified
 from dt_viz.ui.scene.palette import LIGHT
 from dt_viz.ui.scene.picture import Arrows, Lines, Look
 from dt_viz.ui.scene.rollouts import Rollouts
@@ -78,10 +79,12 @@ def test_a_simplified_mesh_stays_within_a_cell_of_the_original():
 
 
 def test_light_links_have_the_size_of_the_links():
-    for body in bodies(ROBOT):
-        shell = body.parts[0][1]
-        assert len(body.light.faces) < len(shell.faces) / 2
-        np.testing.assert_allclose(body.light.bounds, shell.bounds, atol=CELL)
+    links = light_links(ROBOT)
+    assert list(links) == [1, 2, 3, 4, 5]
+    for joint, light in links.items():
+        ((_, shell),) = [part for part in bodies(ROBOT)[joint + 1].parts if part[0] == LIGHT.arm]
+        assert len(light.faces) < len(shell.faces) / 2
+        np.testing.assert_allclose(light.bounds, shell.bounds, atol=CELL)
 
 
 # --- The scene ---
@@ -114,25 +117,48 @@ def test_arms_along_the_motion_stand_where_the_arm_would(scene):
     onion.visible = True  # drawn while hidden: it catches up
     for which, q in enumerate(arms_along(ROBOT, arm)):
         arms.pose(q, q)
-        for index, link in enumerate(onion.links, start=ROBOT.num_fixed + 1):
-            pose = world_pose(arms.arm.frames, index)
+        for joint, link in onion.links.items():
+            pose = world_pose(arms.arm.frames, joint + 1)
             np.testing.assert_allclose(link.position + link.batched_positions[which], pose.translation(), atol=1e-6)
             turned = transforms.SO3(link.batched_wxyzs[which].astype(float)).as_matrix()
             np.testing.assert_allclose(turned, pose.rotation().as_matrix(), atol=1e-6)
 
 
+@pytest.mark.parametrize("arm", OTHER_ARMS)  # that of seven has a link of which nothing is drawn
+def test_an_arm_with_other_joints_is_drawn_where_its_kinematics_say(server, scene, arm):
+    robot = OTHER_ARMS[arm]()
+    arms, q = Arms(scene, robot), robot.home + np.linspace(0.1, 0.6, robot.num_joints)
+    arms.show(View(ghost_arm=True, body_points=True))
+    arms.pose(q, robot.home)
+    rotations, origins = robot.forward_kinematics(q)
+    for joint, (rotation, origin) in enumerate(zip(rotations, origins, strict=True)):
+        pose = world_pose(arms.arm.frames, joint + 1)
+        np.testing.assert_allclose(pose.translation(), origin, atol=1e-6)
+        np.testing.assert_allclose(pose.rotation().as_matrix(), rotation, atol=1e-6)
+    shown = [link.visible for link in arms.ghost.links]
+    assert len(shown) == sum(bool(body.parts) for body in bodies(robot)[2:]) and any(shown)
+    plots, times = JointPlots(server.gui, robot), np.linspace(0.0, 2.0, 9)
+    plots.visible = True
+    joints = robot.home + np.linspace(0, 1, 9)[:, None] * (q - robot.home)
+    plots.follow(ArmMotion(times, joints, joints))
+    num_limited = np.isfinite(robot.lower).sum()
+    assert len(plots.angles.data) == 1 + robot.num_joints + 2 * num_limited
+    np.testing.assert_allclose(np.radians([curve[-1] for curve in plots.angles.data[1 : robot.num_joints + 1]]), q)
+    assert len(plots.speeds.data) == 2 + robot.num_joints
+
+
 def test_arms_along_the_motion_send_nothing_while_hidden_and_follow_while_shown(scene):
     onion = ArmSequence(scene, ROBOT)
-    before = onion.links[0].batched_positions.copy()
+    before = onion.links[1].batched_positions.copy()
     onion.draw(frame(motion()), Look())
-    np.testing.assert_array_equal(onion.links[0].batched_positions, before)
+    np.testing.assert_array_equal(onion.links[1].batched_positions, before)
     onion.visible = True
-    earlier = onion.links[0].batched_wxyzs.copy()
+    earlier = onion.links[1].batched_wxyzs.copy()
     onion.draw(frame(replace(motion(), q=motion().q + 0.2)), Look())
-    shown = onion.links[0].batched_wxyzs.copy()
+    shown = onion.links[1].batched_wxyzs.copy()
     assert np.abs(shown - earlier).max() > 0.05
     onion.draw(frame(None), Look())  # no motion: they stay
-    np.testing.assert_array_equal(onion.links[0].batched_wxyzs, shown)
+    np.testing.assert_array_equal(onion.links[1].batched_wxyzs, shown)
 
 
 def test_body_points_move_with_the_arm_and_lines_say_from_where(scene):

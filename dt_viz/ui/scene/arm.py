@@ -19,7 +19,7 @@ from dt_viz.robot.robot import Robot
 from dt_viz.scenario.scenario import View
 from dt_viz.session.engine import ArmMotion
 from dt_viz.session.frame import Frame
-from dt_viz.ui.scene.links import bodies
+from dt_viz.ui.scene.links import bodies, light_links
 from dt_viz.ui.scene.palette import LIGHT, linear
 from dt_viz.ui.scene.picture import Following, Lines, Look, Picture, Shown, add_label
 from dt_viz.ui.scene.style import STYLES
@@ -28,11 +28,6 @@ SEEN = 4e-4
 """Smallest motion of the hand by a joint that is drawn, metres: a third of a pixel, about."""
 MIN_APART = 0.006
 """Smallest distance of a link from its ghost at which the ghost is shown, metres: coinciding surfaces flicker."""
-
-
-def _first_moving(robot: Robot) -> int:
-    """Index of the first body, the base before all links, that motions move away from something."""
-    return robot.num_fixed + 1
 
 
 class ArmFrames:
@@ -66,7 +61,8 @@ class ArmPicture(ArmFrames):
     def __init__(self, scene: viser.SceneApi, robot: Robot) -> None:
         super().__init__(scene, robot, "/arm")
         self.meshes: list[viser.MeshHandle] = []
-        self._first_moving = _first_moving(robot)
+        self._moving = self.frames[1 + robot.num_fixed]
+        """Frame of the first link that motions move away from something."""
         for frame, body in zip(self.frames, bodies(robot), strict=True):
             for k, (colour, mesh) in enumerate(body.parts):
                 name = f"{frame.name}/part_{k}"
@@ -77,12 +73,12 @@ class ArmPicture(ArmFrames):
     def show(self, *, whole: bool, pedestal: bool) -> None:
         """Show the whole arm, or only the pedestal under other pictures of it, or nothing."""
         self.frames[0].visible = whole or pedestal
-        self.frames[self._first_moving].visible = whole
+        self._moving.visible = whole
 
     @property
     def visible(self) -> bool:
         """Whether the whole arm is shown."""
-        return self.frames[0].visible and self.frames[self._first_moving].visible
+        return self.frames[0].visible and self._moving.visible
 
     @property
     def stale(self) -> bool:
@@ -101,15 +97,15 @@ class GhostArm(Shown):
 
     def __init__(self, scene: viser.SceneApi, robot: Robot, name: str = "/ghost_arm") -> None:
         """Make the arm, hidden, under a name in the scene tree."""
-        self._robot, self._moving = robot, slice(_first_moving(robot), None)
+        self._robot, shells = robot, light_links(robot)
         self._tree = ArmFrames(scene, robot, name)
         super().__init__(self._tree.frames[0])
         self.visible = False
-        shells = [body.light for body in bodies(robot)[self._moving]]
-        self._corners = np.stack([trimesh.bounds.corners(shell.bounds) for shell in shells])  # (L, 8, 3)
+        self._joints = list(shells)
+        self._corners = np.stack([trimesh.bounds.corners(shell.bounds) for shell in shells.values()])  # (L, 8, 3)
         self.links = tuple(
             scene.add_mesh_simple(
-                f"{frame.name}/shell",
+                f"{self._tree.frames[joint + 1].name}/shell",
                 shell.vertices,
                 shell.faces,
                 color=STYLES.arm_ghost.on(LIGHT),
@@ -117,15 +113,15 @@ class GhostArm(Shown):
                 cast_shadow=False,
                 receive_shadow=False,
             )
-            for frame, shell in zip(self._tree.frames[self._moving], shells, strict=True)
+            for joint, shell in shells.items()
         )
 
     def pose(self, q: Array, without: Array) -> None:
         """Show the joint angles `without` (n,), rad, beside an arm at `q` (n,), rad."""
         self._tree.pose(without)
         rotations, origins = self._robot.forward_kinematics(np.stack([q, without]))
-        carried = slice(self._moving.start - 1, None)
-        corners = self._corners @ rotations[:, carried].swapaxes(-1, -2) + origins[:, carried, None]  # (2, L, 8, 3)
+        turned = self._corners @ rotations[:, self._joints].swapaxes(-1, -2)
+        corners = turned + origins[:, self._joints, None]  # (2, L, 8, 3)
         moved = np.linalg.norm(corners[1] - corners[0], axis=-1).max(axis=-1)
         for link, distance in zip(self.links, moved, strict=True):
             link.visible = bool(distance > MIN_APART)
@@ -163,12 +159,12 @@ class ArmSequence(Following, Picture):
         self._robot = robot
         colour = np.array(linear(LIGHT.onion), np.uint8)
         opacities = np.linspace(0.12, 0.5, NUM_ARMS, dtype=np.float32)
-        self.links = tuple(
-            _add_copies(
-                scene, f"/onion/link_{index}", body.light, NUM_ARMS, batched_colors=colour, batched_opacities=opacities
-            )
-            for index, body in list(enumerate(bodies(robot)))[_first_moving(robot) :]
-        )
+        look = {"batched_colors": colour, "batched_opacities": opacities}
+        self.links = {
+            joint: _add_copies(scene, f"/onion/link_{joint + 1}", shell, NUM_ARMS, **look)
+            for joint, shell in light_links(robot).items()
+        }
+        """Pictures of the links, by joint."""
 
     def draw(self, frame: Frame, look: Look) -> None:
         self.follow(frame.arm)
@@ -176,7 +172,7 @@ class ArmSequence(Following, Picture):
     def _show(self, motion: ArmMotion) -> None:
         rotations, origins = self._robot.forward_kinematics(arms_along(self._robot, motion))
         wxyzs = transforms.SO3.from_matrix(rotations).wxyz
-        for joint, link in enumerate(self.links, start=_first_moving(self._robot) - 1):
+        for joint, link in self.links.items():
             # the browser blends nodes from far to near by their own positions
             link.position = middle = origins[:, joint].mean(axis=0)
             link.batched_positions = (origins[:, joint] - middle).astype(np.float32)

@@ -23,9 +23,7 @@ class Body:
     placement: Array
     """(4, 4) pose in the frame of the joint before, that of the base in the world; all joint angles zero, metres."""
     parts: tuple[tuple[Colour, trimesh.Trimesh], ...]
-    """What has one colour, with it."""
-    light: trimesh.Trimesh
-    """All with at most a third of the triangles, and without parts that have a colour of their own beside the arm's."""
+    """What has one colour, with it; none where nothing is drawn."""
 
 
 @lru_cache(maxsize=4)
@@ -42,10 +40,22 @@ def bodies(robot: Robot) -> tuple[Body, ...]:
                 shape = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
                 found.setdefault(mesh.colour, []).append(shape)
         merged = {colour: _merged(meshes) for colour, meshes in found.items()}
-        parts = tuple((colour or LIGHT.arm, mesh) for colour, mesh in merged.items())
-        light = merged[None] if None in merged else _merged(list(merged.values()))
-        result.append(Body(placement, parts, simplified(light, CELL)))
+        result.append(Body(placement, tuple((colour or LIGHT.arm, mesh) for colour, mesh in merged.items())))
     return tuple(result)
+
+
+@lru_cache(maxsize=4)
+def light_links(robot: Robot) -> dict[int, trimesh.Trimesh]:
+    """Meshes with at most a third of the triangles, by joint, of what motions move away from something.
+
+    Parts with a colour of their own, beside others in the arm's, are left out.
+    """
+    links = {}
+    for joint, body in enumerate(bodies(robot)[1:]):
+        plain = [mesh for colour, mesh in body.parts if colour == LIGHT.arm]
+        if joint >= robot.num_fixed and body.parts:
+            links[joint] = simplified(_merged(plain or [mesh for _, mesh in body.parts]), CELL)
+    return links
 
 
 def simplified(mesh: trimesh.Trimesh, cell: float) -> trimesh.Trimesh:
@@ -63,7 +73,7 @@ def simplified(mesh: trimesh.Trimesh, cell: float) -> trimesh.Trimesh:
 
 
 def _merged(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
-    merged = trimesh.util.concatenate(meshes) if meshes else trimesh.Trimesh()
+    merged = trimesh.util.concatenate(meshes)
     assert isinstance(merged, trimesh.Trimesh)
     merged.merge_vertices()
     return merged
