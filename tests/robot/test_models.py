@@ -68,9 +68,10 @@ def test_spheres_hold_the_links_and_stick_out_by_little(name):
     ends = robot.body.spheres["end"]
     assert (ends > np.arange(len(ends))).all() and (np.diff(robot.body.spheres["joint"]) >= 0).all()
     for k in np.flatnonzero(ends > np.arange(len(ends)) + 1):
-        held = robot.body.spheres[k : ends[k]]
-        away = np.linalg.norm(held["offset"] - held["offset"][0], axis=1) + held["radius"]
-        assert away.max() <= held["radius"][0] + 3e-5
+        held, own = robot.body.spheres[k : ends[k]], robot.body.spheres[k]
+        held = held[held["end"] == k + np.arange(len(held)) + 1]  # the smallest
+        away = np.linalg.norm(held["offset"] - own["offset"], axis=1) + held["radius"]
+        assert away.max() <= own["radius"] + 1e-9
 
 
 @each_arm
@@ -166,7 +167,7 @@ def forget(monkeypatch, folder: Path) -> None:
 
 def test_an_arm_is_kept_and_found_again_and_made_anew_if_its_file_is_damaged(tmp_path, monkeypatch, caplog):
     forget(monkeypatch, tmp_path)
-    path, made = write(tmp_path, urdf(4)), []
+    path, made = write(tmp_path, urdf(4, shape=BALL)), []
     real = models.covering_tree
     monkeypatch.setattr(models, "covering_tree", lambda *given: made.append(1) or real(*given))
     told: list[tuple[float, str]] = []
@@ -183,12 +184,14 @@ def test_an_arm_is_kept_and_found_again_and_made_anew_if_its_file_is_damaged(tmp
         same(robot, robot_from_urdf(path))
         assert file.read_bytes() == content and "damaged" in caplog.text
     assert len(made) == 4
-    write(tmp_path, urdf(4, link("aside").replace("aside", "l9") + BRANCH))  # another file: another arm
+    write(tmp_path, urdf(4, link("aside").replace("aside", "l9") + BRANCH, shape=BALL))  # another file: another arm
     assert len(robot_from_urdf(path).meshes) == 6 and len(made) == 5
     robot_from_urdf(path, home=(0.1, 0.5, 0.5, 0.1))
     assert len(made) == 6
 
 
+BALL = '<geometry><sphere radius="0.03"/></geometry>'
+"""A shape that is covered quickly."""
 BRANCH = '<joint name="on" type="fixed"><parent link="l0"/><child link="l9"/></joint>'
 
 
@@ -236,14 +239,16 @@ def test_states_of_an_srdf_are_homes_where_they_name_all_joints(tmp_path):
 
 def test_a_given_front_and_home_are_taken(tmp_path, monkeypatch):
     forget(monkeypatch, tmp_path)
-    path, home = write(tmp_path, urdf(4)), (0.2, 0.6, -0.4, 0.3)
+    path, home = write(tmp_path, urdf(4, shape=BALL)), (0.2, 0.6, -0.4, 0.3)
     robot = robot_from_urdf(path, home=home, front="y", name="mine")
     np.testing.assert_array_equal(robot.home, home)
     np.testing.assert_allclose(robot.base @ [0, 1, 0], [0, -1, 0], atol=1e-15)
     assert robot.name == robot.title == "mine" and "front" in robot.report()
     plain = robot_from_urdf(path, home=home, front="-y")
     np.testing.assert_allclose(robot.end_effector(home), robot.base @ plain.end_effector(home), atol=1e-12)
-    assert robot_from_urdf(write(tmp_path, urdf(4, name=""), "anonymous.urdf"), home=home).name == "anonymous"
+    assert (
+        robot_from_urdf(write(tmp_path, urdf(4, name="", shape=BALL), "anonymous.urdf"), home=home).name == "anonymous"
+    )
 
 
 def test_names_that_nobody_knows_are_told(monkeypatch):
@@ -279,7 +284,7 @@ def descriptions(tmp_path, monkeypatch):
     for name, text in files.items():
         write(folder, text, name)
     (tmp_path / "files" / "small").mkdir(parents=True)
-    write(tmp_path / "files" / "small", urdf(4))
+    write(tmp_path / "files" / "small", urdf(4, shape=BALL))
     monkeypatch.setenv("ROBOT_DESCRIPTIONS_CACHE", str(tmp_path / "files"))
     monkeypatch.setitem(sys.modules, "robot_descriptions", package)
     yield
@@ -315,4 +320,4 @@ def test_hollows_count_as_solid_unless_they_are_open_to_more_sides_than_one():
     for spheres in (closed, open_to_one):
         assert spheres[:, 3].max() > 0.05  # in the middle
     assert open_to_two[:, 3].max() < 0.02  # only the walls
-    assert len(open_to_two) > 3 * len(closed)
+    assert len(open_to_two) > 2 * len(closed)
