@@ -33,6 +33,14 @@ each_arm = pytest.mark.parametrize(
 )
 
 
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory):
+    """A cache folder of this module's own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
 def on_surface(mesh, num=20_000):
     """All vertices, and points spread evenly over the triangles."""
     rng, corners = np.random.default_rng(0), mesh.vertices[mesh.faces]
@@ -71,7 +79,7 @@ def test_spheres_hold_the_links_and_stick_out_by_little(name):
         held, own = robot.body.spheres[k : ends[k]], robot.body.spheres[k]
         held = held[held["end"] == k + np.arange(len(held)) + 1]  # the smallest
         away = np.linalg.norm(held["offset"] - own["offset"], axis=1) + held["radius"]
-        assert away.max() <= own["radius"] + 1e-9
+        assert away.max() <= own["radius"] + 5e-5  # by rounding
 
 
 @each_arm
