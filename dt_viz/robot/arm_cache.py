@@ -14,12 +14,10 @@ import numpy as np
 from dt_viz.files.npz import arrays_of, npz_bytes, write_whole
 from dt_viz.kernels.arm import BODY_POINT
 from dt_viz.robot.body_points import BodyPoints
-from dt_viz.robot.meshes import LinkMesh, VisualMesh
+from dt_viz.robot.meshes import LinkMesh, VisualMesh, constant
 from dt_viz.robot.robot import Robot
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
     from dt_viz.flows.fields import Array
 
 logger = logging.getLogger(__name__)
@@ -127,18 +125,6 @@ def _meshes(arrays: Mapping[str, np.ndarray], kind: str) -> list[tuple[str, int,
         zip(arrays[f"{kind}_names"].tolist(), arrays[f"{kind}_joints"].tolist(), strict=True)
     )
     return [
-        (name, joint, constant(vertices), still(faces))
+        (name, joint, constant(vertices), constant(faces, np.intp))
         for (name, joint), vertices, faces in zip(names, parts["vertices"], parts["faces"], strict=True)
     ]
-
-
-def constant(values: ArrayLike) -> Array:
-    """Return a read-only copy."""
-    return still(np.array(values, dtype=float))
-
-
-def still(values: np.ndarray) -> np.ndarray:
-    """Return an array of indices or numbers, read-only; indices as numpy counts."""
-    values = values if values.dtype.kind == "f" else values.astype(np.intp)
-    values.flags.writeable = False
-    return values

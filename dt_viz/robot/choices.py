@@ -101,9 +101,7 @@ def find_front(
         FormatError: what is given is no horizontal direction.
     """
     if given is not None:
-        front = np.array(
-            AXES[given] if isinstance(given, str) and given in AXES else given if not isinstance(given, str) else ()
-        )
+        front = np.array(AXES.get(given, ()) if isinstance(given, str) else given, dtype=float)
         if front.shape not in {(2,), (3,)} or not np.isfinite(front).all() or not np.linalg.norm(front[:2]) > 0:
             raise FormatError("front", repr(given), f"{', '.join(AXES)} or a horizontal direction (x, y)")
         return front[:2] / np.linalg.norm(front[:2]), "given"
@@ -146,32 +144,26 @@ def find_touching(
     Those are pairs that an SRDF does not compare although they could meet, and pairs that are near in nearly all of
     many random postures: a constant gap is no danger.
     """
-    joint_of = {mesh.name: mesh.joint for mesh in meshes}
-    apart = [pair for pair in combinations(joint_of, 2) if abs(joint_of[pair[0]] - joint_of[pair[1]]) > 1]
+    arm, rng = solids.robot, np.random.default_rng(2)
     told = [] if semantic is None else list(semantic.iter("disable_collisions"))
     excepted = {
         frozenset((str(pair.get("link1")), str(pair.get("link2")))) for pair in told if pair.get("reason") != "Never"
     }
-    named = {frozenset(pair) for pair in apart} & excepted
-    kinematics, measure = solids.robot, BetweenLinks(solids.links, frozenset(named))
-    near, names = settings.near * kinematics.reach, [mesh.name for mesh in meshes]
     pairs = [
-        pair for pair in combinations(range(len(meshes)), 2) if frozenset((names[pair[0]], names[pair[1]])) not in named
-    ]
-    pairs = [(a, b) for a, b in pairs if meshes[b].joint - meshes[a].joint > 1]
-    left = np.arange(len(pairs))
-    counts = np.zeros(len(pairs), int)
-    for num, q in enumerate(ranges.random(np.random.default_rng(2), settings.num_postures), start=1):
-        poses = Poses.of(kinematics, q[None])
-        lower = measure.lower(poses, np.zeros(len(left), np.intp), left) if len(left) else np.empty(0)
-        for item in left[lower < near]:
+        frozenset((a.name, b.name)) for a, b in combinations(meshes, 2) if b.joint - a.joint > 1
+    ]  # as `BetweenLinks` has them
+    named = frozenset(pairs) & excepted
+    pairs = [pair for pair in pairs if pair not in named]
+    measure, near = BetweenLinks(solids.links, named), settings.near * arm.reach
+    left, counts = np.arange(len(pairs)), np.zeros(len(pairs), int)
+    for num, q in enumerate(ranges.random(rng, settings.num_postures), start=1):
+        if not len(left):
+            break
+        poses = Poses.of(arm, q[None])
+        for item in left[measure.lower(poses, np.zeros(len(left), np.intp), left) < near]:
             counts[item] += measure.distance(poses, 0, int(item), near) < near
         left = left[counts[left] >= settings.always * num - 1]  # the others are apart often enough
-    always = {
-        frozenset(names[k] for k in pairs[item])
-        for item in left
-        if counts[item] >= settings.always * settings.num_postures
-    }
+    always = {pairs[item] for item in left if counts[item] >= settings.always * settings.num_postures}
     reasons = [f"{len(named)} of the SRDF"] if told else []
     reasons.append(f"{len(always)} nearer than {1e3 * near:.0f} mm in {settings.always:.0%} of random postures")
     return frozenset(named | always), ", ".join(reasons)

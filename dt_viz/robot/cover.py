@@ -53,8 +53,12 @@ class CoverSettings:
     one side alone. 0 leaves all hollows, and all candidates."""
     rounding: float = 1.4
     """Largest radius of a body point, in halves of its link's thickness."""
+    across: float = 1.15
+    """Least such radius, in that of a ball which holds the link across."""
     radii: tuple[float, float] = (0.03, 0.085)
     """Least and largest value of that radius, in the arm's reach."""
+    most: int = 16
+    """Largest number of body points of a link, whatever their radius."""
     num_starts: int = 1
     """Number of beginnings of the clustering, the best of which is taken."""
     rounds: int = 12
@@ -138,10 +142,20 @@ def _evenly(num: int) -> Array:
     return np.stack([ring * np.cos(angle), ring * np.sin(angle), height], axis=1)
 
 
-def thickness(mesh: LinkMesh) -> float:
-    """Compute the middle side, metres, of a box along the principal axes of a link: what is thick of it."""
+def usual_radius(mesh: LinkMesh, reach: float, settings: CoverSettings) -> float:
+    """Compute the largest radius of a link's body points, metres, from its thickness: no less than holds it across.
+
+    Args:
+        mesh: the link.
+        reach: of the arm, metres.
+        settings: of the cover.
+    """
     points = mesh.vertices - mesh.vertices.mean(axis=0)
-    return float(np.sort(np.ptp(points @ np.linalg.svd(points, full_matrices=False)[2].T, axis=0))[-2])
+    along = points @ np.linalg.svd(points, full_matrices=False)[2].T  # principal axes, the longest first
+    sides = np.sort(np.ptp(along, axis=0))
+    across = min(np.linalg.norm(along[:, 1:], axis=1).max(), np.hypot(*sides[:2]) / 2) + settings.protrusion
+    low, high = (part * reach for part in settings.radii)
+    return float(np.clip(max(settings.rounding * sides[1] / 2, settings.across * across), low, high))
 
 
 class _Solid(NamedTuple):
@@ -262,18 +276,14 @@ def _ridges(depth: Array) -> Mask:
 
 
 def _clusters(spheres: Spheres, largest: float, settings: CoverSettings) -> list[Spheres]:
-    """Part spheres so that bounding spheres are not larger than wanted."""
-    rng = np.random.default_rng(0)
-    for k in range(1, len(spheres) + 1):
-        found = [
-            part
-            for _ in range(settings.num_starts)
-            for part in _clusterings(spheres, min(k, len(spheres)), rng, settings)
-        ]
+    """Part spheres so that bounding spheres are not larger than wanted, or into as many parts as there may be."""
+    rng, most = np.random.default_rng(0), min(settings.most, len(spheres))
+    for k in range(1, most + 1):
+        found = [part for _ in range(settings.num_starts) for part in _clusterings(spheres, k, rng, settings)]
         radius, best = min(found, key=lambda found: found[0])
-        if radius <= largest:
+        if radius <= largest or k == most:
             return best
-    return list(spheres[:, None])
+    return []
 
 
 def _clusterings(

@@ -22,12 +22,12 @@ from scipy.spatial.transform import Rotation
 
 from dt_viz.errors import FormatError
 from dt_viz.robot.kinematics import Kinematics
-from dt_viz.robot.meshes import LinkMesh, VisualMesh
+from dt_viz.robot.meshes import LinkMesh, VisualMesh, constant
 from dt_viz.robot.tool_chain import ArmChain
 from dt_viz.robot.urdf import Description
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
+    from numpy.typing import NDArray
 
     from dt_viz.flows.fields import Array, Indices
 
@@ -188,18 +188,15 @@ def _turned(vectors: Array, turn: Array) -> Array:
     return np.asarray(vectors) if np.array_equal(turn, np.eye(3)) else vectors @ turn
 
 
-def _placed(vertices: Array, faces: Indices, shape: Any, turns: Sequence[Array]) -> tuple[Array, Indices]:  # noqa: ANN401
+def _placed(vertices: Array, faces: Indices, shape: Any, turns: Sequence[Array]) -> tuple[Array, NDArray[np.intp]]:  # noqa: ANN401
     """Place a shape in the frame of its joint."""
     placed = vertices @ shape.placement.rotation.T + shape.placement.translation
-    faces = np.array(faces, dtype=np.intp)
-    faces.flags.writeable = False
-    return constant(_turned(placed, turns[shape.parentJoint])), faces
+    return constant(_turned(placed, turns[shape.parentJoint])), constant(faces, np.intp)
 
 
 def _joined(mesh: LinkMesh, other: LinkMesh) -> LinkMesh:
     """Join two shapes of a link."""
-    faces = np.concatenate([mesh.faces, other.faces + len(mesh.vertices)])
-    faces.flags.writeable = False
+    faces = constant(np.concatenate([mesh.faces, other.faces + len(mesh.vertices)]), np.intp)
     return LinkMesh(mesh.name, mesh.joint, constant(np.concatenate([mesh.vertices, other.vertices])), faces)
 
 
@@ -250,10 +247,3 @@ def _coloured_parts(path: Path, scale: Array) -> list[tuple[str, Array, Indices,
             red, green, blue = (int(value) for value in colour[:3])
             parts.append((path.name, np.array(mesh.vertices) * scale, np.array(mesh.faces), (red, green, blue)))
     return parts
-
-
-def constant(values: ArrayLike) -> Array:
-    """Return a read-only copy."""
-    array = np.array(values, dtype=float)
-    array.flags.writeable = False
-    return array

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, DTypeLike, NDArray
 
     from dt_viz.flows.fields import Array
 
@@ -32,3 +33,10 @@ class VisualMesh(LinkMesh):
 
     colour: tuple[int, int, int] | None = None
     """Red, green and blue up to 255; None is the page's colour of an arm."""
+
+
+def constant(values: ArrayLike, dtype: DTypeLike = float) -> NDArray[Any]:
+    """Return a read-only copy."""
+    array = np.array(values, dtype=dtype)
+    array.flags.writeable = False
+    return array

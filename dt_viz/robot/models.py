@@ -29,10 +29,10 @@ from dt_viz.robot.choices import (
     to_front,
 )
 from dt_viz.robot.collision import CollisionModel
-from dt_viz.robot.cover import CoverSettings, covering_tree, protrusion, thickness
+from dt_viz.robot.cover import CoverSettings, covering_tree, protrusion, usual_radius
 from dt_viz.robot.kinematics import Kinematics
-from dt_viz.robot.link_shapes import Shapes, constant, read_shapes, reduced
-from dt_viz.robot.meshes import LinkMesh
+from dt_viz.robot.link_shapes import Shapes, read_shapes, reduced
+from dt_viz.robot.meshes import constant
 from dt_viz.robot.robot import Robot
 from dt_viz.robot.tool_chain import ArmChain, find_chain
 from dt_viz.robot.urdf import ArmError, read_description, read_semantic
@@ -179,7 +179,7 @@ def _load_described(name: str, progress: Progress | None) -> Robot:
     """Load an arm that the package robot_descriptions knows and has downloaded."""
     accepted = f"{', '.join(ARMS)}; or a name of the package robot_descriptions"
     try:
-        cache = importlib.import_module("robot_descriptions._cache")
+        cache: Any = importlib.import_module("robot_descriptions._cache")
         repositories = importlib.import_module("robot_descriptions._repositories").REPOSITORIES
     except ImportError as error:
         raise ArmError("arm", "name", repr(name), f"{accepted}: pip install robot_descriptions") from error
@@ -322,7 +322,7 @@ class _Given:
                 body = BodyPoints(
                     covering_tree(
                         meshes,
-                        self._largest(arm),
+                        lambda mesh: usual_radius(mesh, arm.reach, self.cover),
                         self.cover,
                         lambda part: tell(0.1 + 0.6 * part, "covering the links with spheres"),
                     )
@@ -373,11 +373,6 @@ class _Given:
                 ("may touch", f"{pairs or 'no other links'}: {touching_why}"),
             ),
         )
-
-    def _largest(self, arm: Kinematics) -> Callable[[LinkMesh], float]:
-        """Return the function of the largest radius of a link's body points, metres."""
-        low, high = (part * arm.reach for part in self.cover.radii)
-        return lambda mesh: float(np.clip(self.cover.rounding * thickness(mesh) / 2, low, high))
 
 
 def _turned(shapes: Shapes, base: Array) -> Shapes:

@@ -215,13 +215,13 @@ def _joint(name: str, element: Element) -> Joint:
     kind = element.get("type", "")
     if kind not in (*MOVING, "fixed"):
         raise FormatError(f"joint {name}: type", repr(kind), ", ".join((*MOVING, "fixed")))
-    ends = []
+    ends = {}
     for tag in ("parent", "child"):
         link = element.find(tag)
         if link is None or not link.get("link"):
             raise FormatError(f"joint {name}", f"no {tag} link", f'<{tag} link="…"/>')
-        ends.append(str(link.get("link")))
-    return Joint(name, kind, *ends, element)
+        ends[tag] = str(link.get("link"))
+    return Joint(name, kind, ends["parent"], ends["child"], element)
 
 
 def numbers(element: Element | None, key: str, field: str, default: tuple[float, ...] = (0.0, 0.0, 0.0)) -> Array:

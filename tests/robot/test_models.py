@@ -1,5 +1,8 @@
 """Arms by name and from files: what is found of them holds, is kept, and two are there at once."""
 
+# pyright: reportAttributeAccessIssue=false
+# (coal has no stubs)
+
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -28,6 +31,14 @@ QUICK = ("so100", "xarm7")
 each_arm = pytest.mark.parametrize(
     "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in ARMS if name != "jaco"]
 )
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory):
+    """A cache folder of this module's own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
 
 
 def on_surface(mesh, num=20_000):
@@ -65,9 +76,10 @@ def test_spheres_hold_the_links_and_stick_out_by_little(name):
     ends = robot.body.spheres["end"]
     assert (ends > np.arange(len(ends))).all() and (np.diff(robot.body.spheres["joint"]) >= 0).all()
     for k in np.flatnonzero(ends > np.arange(len(ends)) + 1):
-        held = robot.body.spheres[k : ends[k]]
-        away = np.linalg.norm(held["offset"] - held["offset"][0], axis=1) + held["radius"]
-        assert away.max() <= held["radius"][0] + 3e-5
+        held, own = robot.body.spheres[k : ends[k]], robot.body.spheres[k]
+        held = held[held["end"] == k + np.arange(len(held)) + 1]  # the smallest
+        away = np.linalg.norm(held["offset"] - own["offset"], axis=1) + held["radius"]
+        assert away.max() <= own["radius"] + 5e-5  # by rounding
 
 
 @each_arm
@@ -133,8 +145,15 @@ def test_tasks_are_placed_where_the_arm_follows_them(name, task):
     assert 0.4 * robot.size < placement.scale <= robot.size + 1e-12
     moved = placement(np.array([path[np.linspace(0, len(path) - 1, 60).astype(int)] for path in paths]))
     assert follows(robot, moved, PlacementSettings(error=1e-3))
-    with pytest.raises(UnreachableError, match=r"the largest scale that fits is about"):
-        place(robot, paths, scale=2.5 * robot.size)
+
+
+def test_a_task_that_is_too_large_is_refused_with_the_scale_that_fits():
+    robot, paths = load_arm("so100"), TASKS["push_box"]().paths
+    settings = PlacementSettings(scales=(1.0, 0.4), ahead=(0.0,), up=(0.0,))
+    with pytest.raises(UnreachableError, match=r"SO-100 .* at the scale 1\.04.*: the largest scale .* is about 0\.42"):
+        place(robot, paths, 2.5 * robot.size, settings)
+    with pytest.raises(UnreachableError, match="anywhere ahead of it"):
+        place(robot, paths, 20.0, settings)
 
 
 def test_the_jaco_has_its_tasks_where_they_are():
@@ -156,7 +175,7 @@ def forget(monkeypatch, folder: Path) -> None:
 
 def test_an_arm_is_kept_and_found_again_and_made_anew_if_its_file_is_damaged(tmp_path, monkeypatch, caplog):
     forget(monkeypatch, tmp_path)
-    path, made = write(tmp_path, urdf(4)), []
+    path, made = write(tmp_path, urdf(4, shape=BALL)), []
     real = models.covering_tree
     monkeypatch.setattr(models, "covering_tree", lambda *given: made.append(1) or real(*given))
     told: list[tuple[float, str]] = []
@@ -173,12 +192,14 @@ def test_an_arm_is_kept_and_found_again_and_made_anew_if_its_file_is_damaged(tmp
         same(robot, robot_from_urdf(path))
         assert file.read_bytes() == content and "damaged" in caplog.text
     assert len(made) == 4
-    write(tmp_path, urdf(4, link("aside").replace("aside", "l9") + BRANCH))  # another file: another arm
+    write(tmp_path, urdf(4, link("aside").replace("aside", "l9") + BRANCH, shape=BALL))  # another file: another arm
     assert len(robot_from_urdf(path).meshes) == 6 and len(made) == 5
     robot_from_urdf(path, home=(0.1, 0.5, 0.5, 0.1))
     assert len(made) == 6
 
 
+BALL = '<geometry><sphere radius="0.03"/></geometry>'
+"""A shape that is covered quickly."""
 BRANCH = '<joint name="on" type="fixed"><parent link="l0"/><child link="l9"/></joint>'
 
 
@@ -204,6 +225,7 @@ def test_two_arms_are_there_at_once_and_each_is_loaded_once():
 
 
 def test_what_was_chosen_is_said_with_reasons():
+    report = load_arm("xarm7").report()
     words = ["xArm7: 7 joints, reach 0.82 m", "joint1, joint2", "limits of the URDF", "link_eef: its name"]
     words += [
         "by convention",
@@ -211,7 +233,7 @@ def test_what_was_chosen_is_said_with_reasons():
         "in the mean",
         "may touch",
     ]
-    assert [word for word in words if word not in load_arm("xarm7").report()] == []
+    assert [word for word in words if word not in report] == []
     assert "29 points of 2572 spheres: as shipped" in load_jaco().report()
 
 
@@ -225,14 +247,16 @@ def test_states_of_an_srdf_are_homes_where_they_name_all_joints(tmp_path):
 
 def test_a_given_front_and_home_are_taken(tmp_path, monkeypatch):
     forget(monkeypatch, tmp_path)
-    path, home = write(tmp_path, urdf(4)), (0.2, 0.6, -0.4, 0.3)
+    path, home = write(tmp_path, urdf(4, shape=BALL)), (0.2, 0.6, -0.4, 0.3)
     robot = robot_from_urdf(path, home=home, front="y", name="mine")
     np.testing.assert_array_equal(robot.home, home)
     np.testing.assert_allclose(robot.base @ [0, 1, 0], [0, -1, 0], atol=1e-15)
     assert robot.name == robot.title == "mine" and "front" in robot.report()
     plain = robot_from_urdf(path, home=home, front="-y")
     np.testing.assert_allclose(robot.end_effector(home), robot.base @ plain.end_effector(home), atol=1e-12)
-    assert robot_from_urdf(write(tmp_path, urdf(4, name=""), "anonymous.urdf"), home=home).name == "anonymous"
+    assert (
+        robot_from_urdf(write(tmp_path, urdf(4, name="", shape=BALL), "anonymous.urdf"), home=home).name == "anonymous"
+    )
 
 
 def test_names_that_nobody_knows_are_told(monkeypatch):
@@ -268,7 +292,7 @@ def descriptions(tmp_path, monkeypatch):
     for name, text in files.items():
         write(folder, text, name)
     (tmp_path / "files" / "small").mkdir(parents=True)
-    write(tmp_path / "files" / "small", urdf(4))
+    write(tmp_path / "files" / "small", urdf(4, shape=BALL))
     monkeypatch.setenv("ROBOT_DESCRIPTIONS_CACHE", str(tmp_path / "files"))
     monkeypatch.setitem(sys.modules, "robot_descriptions", package)
     yield
@@ -304,4 +328,4 @@ def test_hollows_count_as_solid_unless_they_are_open_to_more_sides_than_one():
     for spheres in (closed, open_to_one):
         assert spheres[:, 3].max() > 0.05  # in the middle
     assert open_to_two[:, 3].max() < 0.02  # only the walls
-    assert len(open_to_two) > 3 * len(closed)
+    assert len(open_to_two) > 2 * len(closed)
