@@ -10,6 +10,7 @@ from typing import ClassVar, Literal, get_args
 from dt_viz.flows.fields import Array
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.patterns import AugmentedSettings
+from dt_viz.numerics import ZERO
 
 State = Literal["auto", "plain", "augmented"]
 """State that a motion is learned in."""
@@ -30,7 +31,7 @@ class Choice:
 
     def __str__(self) -> str:
         off = ", ".join(
-            f"{state} {1e3 * distance:.1f} mm ({distance / self.shifted_mean:.2f} × the shifted mean)"
+            f"{state} {1e3 * distance:.1f} mm ({distance / max(self.shifted_mean, ZERO):.2f} × the shifted mean)"
             for state, distance in (("plain", self.plain), ("augmented", self.augmented))
         )
         return f"{self.num} demonstrations left out: {off}"

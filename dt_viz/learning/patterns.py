@@ -48,7 +48,7 @@ class AugmentedSettings:
     """Width of the kernel over the starts, in spreads."""
     noise: float = 0.6
     """Variance of shapes that the starts do not explain, relative to what they do, where `explained` is 1."""
-    explained: tuple[float, ...] = (0.0, 0.15, 0.4, 1.0, 2.5)
+    explained: tuple[float, ...] = (0.0, 0.4, 1.0)
     """Variances that starts explain, relative to that, which are tried; with 0 they explain nothing."""
     fadings: tuple[float, ...] = (0.5, 0.7, 1.0, 1.4, 2.0)
     """Powers of u by which an offset fades that are tried."""
