@@ -226,7 +226,7 @@ def test_values_say_in_one_line_what_they_are(drawing, deep):
         (dt.BiasPoint(flat(0.2, 0.1)), r"BiasPoint\(\(0.2, 0.1\) m, radius auto, strength auto\)"),
         (dt.Demonstration(TIMES, PATH, "one"), r"Demonstration\('one': 101×2 positions, metres, 4 s\)"),
         (arm, r"Arm\(.*6 joints.*\)"),
-        (arm.follow(path), r"JointPath\(\d+ samples of 6 joints, .* s, hand .* mm off\)"),
+        (arm.follow(path), r"JointPath\(\d+ samples of 6 joints, .* s, hand up to .* mm beside its path\)"),
         (dt.Controller(push, arm), r"Controller\(Motion\(.*\)\)"),
         (dt.HandController(push, path.positions[0]), r"HandController\(phase 1\.00 of Motion\(.*\)\)"),
     ):

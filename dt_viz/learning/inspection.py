@@ -221,7 +221,7 @@ def _smooth(take: Take, settings: PreparationSettings) -> None:
         take.replace(grid.nodes, smooth, grid.nodes)
     elif curved.any():
         times, (curve, _) = take.times, grid.smoothed(1 / np.median(np.diff(take.times)))
-        inside = np.any([grid.within(times[k], times[k + 1]) for k in gaps[curved]], axis=0)
+        inside = np.any([grid.within(times[k : k + 2]) for k in gaps[curved]], axis=0)
         moments = np.concatenate([times, grid.nodes[inside]])
         order = np.argsort(moments, kind="stable")
         take.replace(moments[order], np.concatenate([take.positions, curve[inside]])[order], moments[order])
@@ -272,7 +272,7 @@ class _Grid:
         spacing = max(float(np.median(np.diff(times))), times[-1] / 2000)
         self.nodes = np.linspace(0.0, times[-1], int(np.rint(times[-1] / spacing)) + 1)
         for k in straight:
-            between = self.nodes[self.within(take.times[k], take.times[k + 1])]
+            between = self.nodes[self.within(take.times[k : k + 2])]
             x = np.concatenate([x, interpolate(between, times, take.positions)])
             times = np.concatenate([times, between])
         self._times, self._x, self._mean = times, x, x.mean(axis=0)
@@ -281,10 +281,10 @@ class _Grid:
         centred = (x - self._mean).T
         self._sums = np.stack([np.bincount(at, row, minlength=len(self.nodes)) for row in centred], axis=1)
 
-    def within(self, first: float, last: float) -> Mask:
-        """Nodes between two moments, seconds, by more than half of their distance."""
+    def within(self, gap: Array) -> Mask:
+        """Nodes between the two moments (2,) of a gap, seconds, by more than half of the distance of nodes."""
         half = self.nodes[1] / 2
-        return (self.nodes > first + half) & (self.nodes < last - half)
+        return (self.nodes > gap[0] + half) & (self.nodes < gap[1] - half)
 
     def smoothed(self, cutoff: float) -> tuple[Array, float]:
         """Positions at the nodes with a cut-off frequency, Hz, and the RMS noise of the samples, metres.

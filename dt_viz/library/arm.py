@@ -34,7 +34,8 @@ class JointPath:
 
     def __repr__(self) -> str:
         off = in_millimetres(float(self.error.max()))
-        return f"JointPath({len(self.q)} samples of {self.q.shape[1]} joints, {self.times[-1]:.3g} s, hand {off} off)"
+        samples = f"{len(self.q)} samples of {self.q.shape[1]} joints, {self.times[-1]:.3g} s"
+        return f"JointPath({samples}, hand up to {off} beside its path)"
 
 
 class BlockedError(Exception):
