@@ -305,8 +305,7 @@ def _mean(paths: Sequence[Array]) -> Array:
 
 
 def _as_posture(posture: Array) -> Posture:
-    a, b, c, d, e, f = (float(angle) for angle in posture)
-    return a, b, c, d, e, f
+    return tuple(float(angle) for angle in posture)
 
 
 def unreachable(error: UnreachableError) -> MotionWarning:

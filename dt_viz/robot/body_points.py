@@ -20,15 +20,16 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 PROTRUSION = 5e-3
-"""Largest distance by which the spheres that cover the links stick out of these, metres; 3 mm on average."""
+"""Largest distance by which the spheres that cover the JACO's links stick out of these, metres; 3 mm on average. Other
+arms have covers of their own (`dt_viz.robot.cover`), 4 mm on average."""
 
 
 @dataclass(frozen=True, eq=False)
 class BodyPoints:
     """Points that move with the links, and spheres around them that hold all of the arm.
 
-    In each of these spheres smaller ones cover the collision meshes and stick out by `PROTRUSION` at most, 3 mm on
-    average: what is measured from obstacles are these.
+    In each of these spheres smaller ones cover the collision meshes and hardly stick out of them: what is measured from
+    obstacles are these.
     """
 
     spheres: NDArray[np.void]

@@ -36,8 +36,10 @@ each_arm = pytest.mark.parametrize(
 @pytest.fixture(scope="module", autouse=True)
 def cache(tmp_path_factory):
     """A cache folder of this module's own."""
+    folder = tmp_path_factory.mktemp("cache")
+    (folder / "dt-viz").mkdir()  # not by the first test, which is to leave nothing behind
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        patch.setenv("XDG_CACHE_HOME", str(folder))
         yield
 
 
