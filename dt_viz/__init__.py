@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from dt_viz.learning.inspection import Finding, Inspection, PreparationSettings
     from dt_viz.learning.patterns import AugmentedSettings
     from dt_viz.learning.preparation import DemonstrationWarning, ImitationError
-    from dt_viz.library.arm import Arm, BlockedError, Controller, JointPath, load_jaco
+    from dt_viz.library.arm import Arm, BlockedError, Controller, JointPath, load_arm, load_jaco
     from dt_viz.library.hand import HandController
     from dt_viz.library.motion import Motion, Path, fit
     from dt_viz.library.takes import example
@@ -69,6 +69,7 @@ __all__ = [
     "Transform",
     "example",
     "fit",
+    "load_arm",
     "load_demonstrations",
     "load_jaco",
 ]
@@ -82,7 +83,7 @@ _MODULES = {
     "learning.patterns": ("AugmentedSettings",),
     "learning.inspection": ("Finding", "Inspection", "PreparationSettings"),
     "learning.preparation": ("DemonstrationWarning", "ImitationError"),
-    "library.arm": ("Arm", "BlockedError", "Controller", "JointPath", "load_jaco"),
+    "library.arm": ("Arm", "BlockedError", "Controller", "JointPath", "load_arm", "load_jaco"),
     "library.hand": ("HandController",),
     "library.motion": ("Motion", "Path", "fit"),
     "library.takes": ("example",),

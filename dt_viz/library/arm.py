@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from dt_viz.control.controller import ArmController
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.flows.fields import Array
-from dt_viz.library.motion import NUM_COORDINATES, Motion, Path
+from dt_viz.learning.demonstrations import Demonstration
+from dt_viz.library.motion import NUM_COORDINATES, Motion
+from dt_viz.library.motion import Path as HandPath
 from dt_viz.motion.following import Follower
 from dt_viz.motion.solve import Solved, solve
 from dt_viz.motion.stack import FINE, LIVE, build_stack
 from dt_viz.robot.inverse_kinematics import inverse_kinematics, track
-from dt_viz.robot.models import load_jaco as load_robot
+from dt_viz.robot.models import EndEffector, robot_from_urdf
+from dt_viz.robot.models import load_arm as load_robot
+from dt_viz.robot.placement import place
 from dt_viz.robot.retiming import within_velocity_limits
 from dt_viz.robot.robot import Robot
 from dt_viz.robot.tracking_settings import TrackingSettings
@@ -43,18 +50,67 @@ class BlockedError(Exception):
 
 
 class Arm:
-    """A robot arm."""
+    """A robot arm of three to eight revolute joints."""
 
     def __init__(self, robot: Robot) -> None:
-        """Wrap a robot; see `load_jaco`."""
+        """Wrap a robot; see `load_arm` and `from_urdf`."""
         self.robot = robot
         self._follower = Follower(robot)
+
+    @classmethod
+    def from_urdf(
+        cls,
+        path: str | os.PathLike[str],
+        end_effector: EndEffector | None = None,
+        home: Sequence[float] | None = None,
+        front: str | Sequence[float] | None = None,
+        srdf: str | os.PathLike[str] | None = None,
+        package_dirs: Sequence[str | os.PathLike[str]] = (),
+        locked: Sequence[str] | Mapping[str, float] | None = None,
+    ) -> Arm:
+        """Load an arm from a URDF; what is not given is found, and `report` says why. It takes seconds the first time.
+
+        Args:
+            path: the URDF, expanded if it comes from xacro.
+            end_effector: link that is the tool frame, or (link, (x, y, z)) with the tool's place in it, metres.
+            home: (n,) ready pose, rad.
+            front: "x", "-x", "y", "-y" or a horizontal direction, in the URDF's base frame.
+            srdf: file that names the end effector, states, and pairs of links that may touch.
+            package_dirs: folders in which the `package://` addresses of meshes resolve.
+            locked: joints that do not move, perhaps each with its value, rad or metres; None locks grippers.
+
+        Raises:
+            DataError: the URDF, a mesh, or what is given cannot be used.
+        """
+        folders = [Path(folder) for folder in package_dirs]
+        semantic = None if srdf is None else Path(srdf)
+        return cls(robot_from_urdf(Path(path), end_effector, home, front, semantic, folders, locked))
+
+    def report(self) -> str:
+        """Say what was chosen of the arm and why, a line for each: joints, tool, front, ready pose, body, limits."""
+        return self.robot.report()
+
+    def place(self, demonstrations: Sequence[Demonstration], scale: float | None = None) -> tuple[Demonstration, ...]:
+        """Move and scale demonstrations in space, made for an arm of the JACO's size, into reach.
+
+        Args:
+            demonstrations: with three coordinates, the arm's front at −y.
+            scale: the scale that is wanted; None takes the largest that fits, up to the arm's reach by the JACO's.
+
+        Raises:
+            UnreachableError: no place fits; it says the largest scale that does.
+            ValueError: demonstrations lie in a plane that has no place in space.
+        """
+        if demonstrations and demonstrations[0].dimension != NUM_COORDINATES:
+            raise ValueError(f"the arm follows motions in space, with 3 coordinates, not {demonstrations[0].dimension}")
+        placed = place(self.robot, [demonstration.positions for demonstration in demonstrations], scale)
+        return tuple(replace(one, positions=placed(one.positions)) for one in demonstrations)
 
     def __repr__(self) -> str:
         first, *_, last = self.robot.joint_names
         return f"Arm({len(self.robot.joint_names)} joints, {first} to {last})"
 
-    def follow(self, path: Path) -> JointPath:
+    def follow(self, path: HandPath) -> JointPath:
         """The joints along a path of the hand.
 
         Args:
@@ -165,11 +221,21 @@ def _live(motion: Motion) -> Solved:
     return Solved(scenario, nominal, nominal, build_stack(nominal, scenario.active, LIVE))
 
 
-def load_jaco(tracking: TrackingSettings | None = None) -> Arm:
-    """The JACO arm, from its URDF.
+def load_arm(name: str = "jaco", tracking: TrackingSettings | None = None) -> Arm:
+    """Load an arm by its name.
 
     Args:
+        name: jaco, panda, ur3, ur5, ur10, xarm7, z1, so100 or so101; or a name of the package robot_descriptions, such
+            as "gen3", where that is installed and has downloaded it.
         tracking: settings of its inverse kinematics; None are the defaults.
+
+    Raises:
+        DataError: there is no such arm; the message lists those that there are.
     """
-    robot = load_robot()
+    robot = load_robot(name)
     return Arm(robot if tracking is None else replace(robot, tracking=tracking))
+
+
+def load_jaco(tracking: TrackingSettings | None = None) -> Arm:
+    """The JACO arm: `load_arm("jaco")`."""
+    return load_arm("jaco", tracking)
