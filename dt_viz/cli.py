@@ -55,8 +55,8 @@ def _serve(options: argparse.Namespace) -> int:
     from dt_viz.learning.demonstrations import load_demonstrations  # noqa: PLC0415
     from dt_viz.learning.imitation import ImitationError  # noqa: PLC0415
     from dt_viz.learning.store import FitStore  # noqa: PLC0415
-    from dt_viz.robot.models import load_jaco  # noqa: PLC0415
     from dt_viz.scenario.tasks import OWN, TaskEntry, known_tasks, own_task  # noqa: PLC0415
+    from dt_viz.session.tasks_in_reach import in_reach  # noqa: PLC0415
     from dt_viz.ui.patches import GateError  # noqa: PLC0415
     from dt_viz.ui.server import AddressError, Server  # noqa: PLC0415
 
@@ -64,7 +64,8 @@ def _serve(options: argparse.Namespace) -> int:
     handler.addFilter(RateLimitFilter())
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s", handlers=[handler])
     try:
-        tasks, robot = known_tasks(options.lasa), load_jaco()
+        robot = _robot(options)
+        tasks = in_reach(known_tasks(options.lasa), robot)
         if options.files:
             how = {name: getattr(options, name) for name in ("rate", "unit", "columns", "topic")}
             own = own_task(load_demonstrations(options.files, **how, arm=robot))
@@ -107,6 +108,23 @@ def _serve(options: argparse.Namespace) -> int:
         preparing.join()
 
 
+def _robot(options: argparse.Namespace) -> Robot:
+    """Load the arm that is asked for. Raises DataError where it cannot be used."""
+    from dt_viz.robot.models import load_arm, robot_from_urdf  # noqa: PLC0415
+
+    bar = _Bar("Getting to know the arm, once")
+    began = time.monotonic()
+
+    def progress(fraction: float, message: str) -> None:
+        if time.monotonic() - began > LOADED:
+            bar(fraction, message)
+
+    if options.urdf is None:
+        return load_arm(options.arm, progress)
+    given = (getattr(options, name) for name in ("urdf", "end_effector", "home", "front", "srdf", "package_dir"))
+    return robot_from_urdf(*given, progress=progress)
+
+
 @contextmanager
 def _interruptible() -> Iterator[None]:
     """Have SIGTERM raise KeyboardInterrupt as Ctrl-C does, once: whoever asks again does not want to wait."""
@@ -146,6 +164,22 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--unit", metavar="UNIT", help="units of the files, such as mm or cm,ms,deg, if not recognised")
     parser.add_argument("--columns", metavar="NAMES", help="names of the files' columns in order, such as t,x,y,z")
     parser.add_argument("--topic", metavar="TOPIC", help="topic of a bag, or frame of its transforms")
+    arm = parser.add_argument_group("arm")
+    which = arm.add_mutually_exclusive_group()
+    which.add_argument(
+        "--arm",
+        default="jaco",
+        metavar="NAME",
+        help="jaco (default), panda, ur3, ur5, ur10, xarm7, z1, so100, so101, or a name of robot_descriptions",
+    )
+    which.add_argument("--urdf", type=Path, metavar="FILE", help="your own arm; what is not given below is found")
+    arm.add_argument("--end-effector", metavar="FRAME", help="link of the URDF that is the tool's frame")
+    arm.add_argument("--home", type=_angles, metavar="A,B,…", help="ready pose, rad: --home=0,-0.8,0,-2.4,0,1.6,0.8")
+    arm.add_argument("--front", metavar="AXIS", help="x, -x, y or -y of the URDF's base: --front=-y")
+    arm.add_argument("--srdf", type=Path, metavar="FILE", help="tool, poses, and links that may touch")
+    arm.add_argument(
+        "--package-dir", type=Path, action="append", default=[], metavar="DIR", help="folder of package:// addresses"
+    )
     parser.add_argument("--task", help="task to begin with (default: your own data, else draw_s)")
     parser.add_argument(
         "--prepare-all",
@@ -180,6 +214,13 @@ def _port(text: str) -> int:
     if not 0 <= port <= MAX_PORT:
         raise argparse.ArgumentTypeError(f"found {text!r}; accepted: 0 (any free port) to {MAX_PORT}")
     return port
+
+
+def _angles(text: str) -> list[float]:
+    try:
+        return [float(angle) for angle in text.split(",")]
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"found {text!r}; accepted: angles in rad, with commas between") from error
 
 
 def _positive(text: str) -> int:

@@ -125,7 +125,8 @@ def test_own_files_are_the_task_that_the_page_begins_with(monkeypatch, tmp_path,
         path = np.stack([300 * s, 100 * s**2 + 10 * k, 200 - 50 * s], axis=1)
         np.savetxt(tmp_path / f"{k}.csv", path, delimiter=",", header="x,y,z", comments="")
 
-    def serve(tasks, _fits, *, task, **_how):
+    def serve(tasks, _fits, robot, *, task, **_how):
+        assert robot.name == "jaco"
         shown = tasks[task]()
         assert (task, shown.title, len(shown.paths)) == ("own_data", "Own data", 2)
         assert {*TASKS} < {*tasks}
@@ -152,6 +153,10 @@ def test_handlers_of_signals_are_as_before_when_it_returns(capsys):
     [
         ("--help", 0, "dt-viz evaluate --help"),
         ("evaluate around --task nothing --out a.npz", 2, "dt-viz evaluate around: --task: found 'nothing'"),
+        ("--arm pr2", 2, "name: found 'pr2'; accepted: jaco, panda, ur3"),
+        ("--urdf nowhere.urdf", 2, "nowhere.urdf: file: found No such file"),
+        ("--home 1,a", 2, "argument --home: found '1,a'; accepted: angles in rad"),
+        ("--arm panda --urdf arm.urdf", 2, "--urdf: not allowed with argument --arm"),
         ("--allow-origin demo.org", 2, "argument --allow-origin: found 'demo.org'; accepted: http://"),
     ],
 )

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,6 +20,9 @@ from dt_viz.obstacles.shapes import as_point
 from dt_viz.scenario.objects import Ball, LiftedBox, Pot, PushedBox, TaskObject
 from dt_viz.scenario.slices import Slice
 from dt_viz.shipped import ASSETS
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 DRAWING_CENTRE = np.array([0.0, -0.50, 0.42])
 """Middle of the vertical drawing plane before the robot, metres. Whoever faces the robot sees it as a blackboard."""
@@ -73,6 +77,25 @@ class Task:
     def system(self, imitation: AnyImitation) -> DiffeomorphicSystem:
         """Return the motion learned from the demonstrations, as a system in the world, metres and seconds."""
         return imitation.system_in(self.origin, self.axes, self.scale)
+
+    def placed(self, scale: float, shift: ArrayLike) -> Task:
+        """Scale and move the task, x ↦ scale·x + shift (3,) metres, without the objects that the JACO's hand moves."""
+
+        def mapped(point: ArrayLike) -> Array:
+            return scale * np.asarray(point) + np.asarray(shift)
+
+        eye, target = (as_point(mapped(point)) for point in self.camera)
+        width, height = self.slice.half_size
+        return replace(
+            self,
+            origin=mapped(self.origin),
+            scale=scale * self.scale,
+            slice=replace(self.slice, centre=mapped(self.slice.centre), half_size=(scale * width, scale * height)),
+            camera=(eye, target),
+            obstacle_position=as_point(mapped(self.obstacle_position)),
+            pots=(),
+            objects=(),
+        )
 
     @cached_property
     def paths(self) -> tuple[Array, ...]:

@@ -60,3 +60,19 @@ def test_own_data_become_a_task_where_they_are_with_a_slice_and_a_camera_that_lo
     assert np.linalg.norm(eye - look_at) > 1 and eye[2] > look_at[2]
     drawing = own_task(tuple(Demonstration(2 * s, path[:, :2], f"{k}") for k, path in enumerate(paths)))
     assert drawing.draws and drawing.title == task.title == "Own data"
+
+
+@pytest.mark.parametrize("name", ["draw_s", "push_box", "drop_pots"])
+def test_a_placed_task_is_the_same_one_scaled_and_moved(name):
+    task, scale, shift = TASKS[name](), 0.6, np.array([0.1, -0.05, 0.2])
+    placed = task.placed(scale, shift)
+    for found, path in zip(placed.paths, task.paths, strict=True):
+        np.testing.assert_allclose(found, scale * path + shift, atol=1e-15)
+    np.testing.assert_allclose(placed.slice.centre, scale * task.slice.centre + shift)
+    np.testing.assert_allclose(placed.slice.half_size, scale * np.array(task.slice.half_size))
+    for point, was in zip(placed.camera, task.camera, strict=True):
+        np.testing.assert_allclose(point, scale * np.array(was) + shift)
+    np.testing.assert_allclose(placed.obstacle_position, scale * np.array(task.obstacle_position) + shift)
+    assert placed.demonstrations is task.demonstrations
+    assert not placed.pots
+    assert not placed.objects

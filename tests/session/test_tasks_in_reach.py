@@ -1,0 +1,44 @@
+"""Tasks are placed where another arm can follow them; the JACO's stay."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dt_viz.robot.placement import follows
+from dt_viz.scenario.tasks import TASKS, Task, TaskEntry
+from dt_viz.session.tasks_in_reach import in_reach
+
+
+def shorter(robot, part):
+    """The JACO with all lengths shorter by a factor, as another arm."""
+    lengths = {name: part * getattr(robot, name) for name in ("joint_translations", "end_effector_offset", "levers")}
+    meshes = tuple(replace(mesh, vertices=part * mesh.vertices) for mesh in robot.meshes)
+    spheres = robot.body.spheres.copy()
+    for name in ("offset", "radius"):
+        spheres[name] *= part
+    return replace(robot, name="other", meshes=meshes, body=replace(robot.body, spheres=spheres), **lengths)
+
+
+def test_tasks_of_the_jaco_stay_as_they_are(robot):
+    assert in_reach(TASKS, robot) is TASKS
+
+
+@pytest.mark.parametrize("name", ["draw_c", "push_box"])
+def test_another_arm_follows_its_tasks(robot, name):
+    arm = shorter(robot, 0.5)
+    task = in_reach(TASKS, arm)[name]()
+    paths = np.array([path[np.linspace(0, len(path) - 1, 30).astype(int)] for path in task.paths])
+    assert follows(arm, paths)
+    assert task.scale == pytest.approx(0.5 * TASKS[name]().scale)
+    assert in_reach(TASKS, arm)[name].title == TASKS[name].title
+
+
+def test_a_task_out_of_every_reach_stays_and_is_said(robot, caplog):
+    far = TASKS["push_box"]()
+    far = replace(far, origin=np.array([0.0, 0.0, -9.0]))
+    entry = TaskEntry("Far", lambda: far)
+    assert isinstance(found := in_reach({"far": entry}, shorter(robot, 0.5))["far"](), Task)
+    assert found is far
+    assert "Far: " in caplog.text
+    assert "cannot follow the task anywhere" in caplog.text
