@@ -224,3 +224,16 @@ def test_the_arm_in_the_loop_gives_way_to_a_ball_that_crosses_and_arrives(push):
     distances = [model.obstacle_distance(q[None], ball)[0][0] for (q, _), ball in zip(pairs, balls, strict=True)]
     assert 0.01 < min(distances) < 0.08  # it came near
     assert np.linalg.norm(arm.robot.end_effector(joints[-1]) - push.goal) < 1e-3
+
+
+def test_without_a_phase_the_field_of_an_augmented_motion_is_that_of_the_nearest_point_of_a_motion():
+    motion = dt.fit(dt.example("push_box"), state="augmented").stack(dt.Avoidance(dt.Sphere((0.10, -0.53, 0.15), 0.15)))
+    start = motion.rollouts()[2].positions[0]
+    (path,) = motion.rollouts([start])
+    y, along = path.positions[5:-5], np.gradient(path.positions, path.times, axis=0)[5:-5]
+    for velocity in (motion.velocity(y), motion.velocity(y, start=start)):
+        cosine = (velocity * along).sum(1) / np.linalg.norm(velocity, axis=1) / np.linalg.norm(along, axis=1)
+        assert cosine.min() > 0.99
+    np.testing.assert_allclose(motion.velocity(start, start=start), motion.velocity(start, 1.0, start), rtol=1e-9)
+    with pytest.raises(dt.FormatError, match="label"):
+        motion.velocity(start, label=7.0)

@@ -72,7 +72,7 @@ class DemonstrationError(DataError):
     """A demonstration that cannot be used."""
 
 
-class Kinematics(Protocol):
+class ForwardKinematics(Protocol):
     """What turns joint angles into places of the hand, such as `dt_viz.robot.robot.Robot`."""
 
     @property
@@ -202,7 +202,7 @@ def load_demonstrations(
     unit: str | None = None,
     columns: str | Sequence[str] | Mapping[str, str] | None = None,
     topic: str | None = None,
-    arm: Kinematics | None = None,
+    arm: ForwardKinematics | None = None,
 ) -> tuple[Demonstration, ...]:
     """Read the demonstrations of files and folders: tables of text, arrays, MATLAB, JSON, Parquet, HDF5, ROS bags.
 
@@ -241,7 +241,7 @@ def read_demonstrations(
     unit: str | None = None,
     columns: str | Sequence[str] | Mapping[str, str] | None = None,
     topic: str | None = None,
-    arm: Kinematics | None = None,
+    arm: ForwardKinematics | None = None,
 ) -> tuple[Demonstration, ...]:
     """Read the demonstrations in the bytes of a file; arguments and errors as of :func:`load_demonstrations`.
 
@@ -259,7 +259,7 @@ def read_demonstrations(
 
 
 def demonstrations_of(
-    found: Sequence[Found], source: str | Path, arm: Kinematics | None = None
+    found: Sequence[Found], source: str | Path, arm: ForwardKinematics | None = None
 ) -> tuple[Demonstration, ...]:
     """Make demonstrations of the takes of one or several files; log lines say what was recognised or is not used.
 
@@ -325,16 +325,16 @@ def _read(file: BinaryIO, source: Path, options: ReadOptions) -> Found:
         return (source, *read_takes(file, source, options))
 
 
-def _num_joints(arm: Kinematics | None) -> int | None:
+def _num_joints(arm: ForwardKinematics | None) -> int | None:
     return None if arm is None else len(_kinematics(arm).joint_names)
 
 
-def _kinematics(arm: Kinematics) -> Kinematics:
+def _kinematics(arm: ForwardKinematics) -> ForwardKinematics:
     """The arm itself, or the robot of a `dt.Arm`."""
     return getattr(arm, "robot", arm)
 
 
-def _hand(take: Take, arm: Kinematics | None) -> np.ndarray:
+def _hand(take: Take, arm: ForwardKinematics | None) -> np.ndarray:
     """Positions (T, d) of the hand, metres, perhaps by an arm's kinematics."""
     q, names = take.joints, take.joint_names
     if take.positions is not None or q is None:

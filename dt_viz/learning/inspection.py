@@ -116,7 +116,7 @@ class Inspection:
 
 
 @dataclass
-class Take:
+class Repaired:
     """A take on its way through the inspection; `times` and `positions` are what has been made of it."""
 
     demonstration: Demonstration
@@ -166,7 +166,7 @@ class Take:
         return Inspection(own.name, float(times[-1] - times[0]), len(times), self.kept, tuple(self.findings))
 
 
-def repair(takes: Sequence[Take], settings: PreparationSettings) -> None:
+def repair(takes: Sequence[Repaired], settings: PreparationSettings) -> None:
     """Look for other units, outliers, gaps, jitter and pauses, in this order, and repair them."""
     _find_units(takes, settings)
     for take in takes:
@@ -175,7 +175,7 @@ def repair(takes: Sequence[Take], settings: PreparationSettings) -> None:
     _find_pauses(takes, settings)
 
 
-def _find_units(takes: Sequence[Take], settings: PreparationSettings) -> None:
+def _find_units(takes: Sequence[Repaired], settings: PreparationSettings) -> None:
     """Look for takes in millimetres among takes in metres."""
     sizes = np.array([np.ptp(take.positions, axis=0).max() for take in takes])
     others = np.quantile(sizes, 0.5, method="lower")
@@ -188,7 +188,7 @@ def _find_units(takes: Sequence[Take], settings: PreparationSettings) -> None:
             take.find("units", f"spans {size:.3g} m; if it is in millimetres, divide positions by 1,000")
 
 
-def _find_outliers(take: Take, settings: PreparationSettings) -> None:
+def _find_outliers(take: Repaired, settings: PreparationSettings) -> None:
     steps = np.linalg.norm(np.diff(take.positions, axis=0), axis=1)
     if len(steps) < 4 or not steps.any():
         return
@@ -210,7 +210,7 @@ def _find_outliers(take: Take, settings: PreparationSettings) -> None:
             take.replace(take.times[~off], take.positions[~off], take.times[~off])
 
 
-def _smooth(take: Take, settings: PreparationSettings) -> None:
+def _smooth(take: Repaired, settings: PreparationSettings) -> None:
     """Bridge gaps and smooth jitter, as far as there are any."""
     if len(take.times) < 8:
         return
@@ -227,7 +227,7 @@ def _smooth(take: Take, settings: PreparationSettings) -> None:
         take.replace(moments[order], np.concatenate([take.positions, curve[inside]])[order], moments[order])
 
 
-def _gaps(take: Take, settings: PreparationSettings) -> tuple[Indices, Mask]:
+def _gaps(take: Repaired, settings: PreparationSettings) -> tuple[Indices, Mask]:
     """Find gaps (G,), the samples before them, and which of them (G,) a curve is to bridge."""
     intervals = np.diff(take.times)
     gaps = np.flatnonzero(intervals > max(settings.gap, 2.5 * np.median(intervals)))
@@ -239,7 +239,7 @@ def _gaps(take: Take, settings: PreparationSettings) -> tuple[Indices, Mask]:
     return gaps, curved
 
 
-def _without_jitter(take: Take, grid: _Grid, settings: PreparationSettings) -> Array | None:
+def _without_jitter(take: Repaired, grid: _Grid, settings: PreparationSettings) -> Array | None:
     """Positions at the nodes of a take that jitters, smoothed as far as what is taken out is noise."""
     duration = take.times[-1]
     cutoff = max(settings.cutoff, settings.cycles / duration)
@@ -266,7 +266,7 @@ class _Grid:
     1/(2π) (c/λ)^¼ / h, for c samples at each node and a distance h of the nodes; where no samples are, it is a cubic.
     """
 
-    def __init__(self, take: Take, straight: Indices) -> None:
+    def __init__(self, take: Repaired, straight: Indices) -> None:
         """Take a take, and the indices of the gaps that are bridged by a straight line."""
         times, x = take.times, take.positions
         spacing = max(float(np.median(np.diff(times))), times[-1] / 2000)
@@ -305,7 +305,7 @@ class _Grid:
         return found, float(np.sqrt((away**2).sum(axis=1).mean() / missed))
 
 
-def _find_pauses(takes: Sequence[Take], settings: PreparationSettings) -> None:
+def _find_pauses(takes: Sequence[Repaired], settings: PreparationSettings) -> None:
     """Look for pauses, and cut them. On the way they stay where most takes have one: these belong to the motion."""
     found = [_pauses(take, settings) for take in takes]
     for take, pauses in zip(takes, found, strict=True):
@@ -322,7 +322,7 @@ def _find_pauses(takes: Sequence[Take], settings: PreparationSettings) -> None:
             _cut(take, np.array(cut))
 
 
-def _pauses(take: Take, settings: PreparationSettings) -> list[tuple[float, float, float]]:
+def _pauses(take: Repaired, settings: PreparationSettings) -> list[tuple[float, float, float]]:
     """Find where a take stands still for long: first and last moments, seconds, and the part of the way behind."""
     even = np.linspace(0.0, take.times[-1], 101)
     places = interpolate(even, take.times, take.positions)
@@ -342,7 +342,7 @@ def _pauses(take: Take, settings: PreparationSettings) -> list[tuple[float, floa
     ]
 
 
-def _cut(take: Take, pauses: Array) -> None:
+def _cut(take: Repaired, pauses: Array) -> None:
     """Cut pauses (N, 2), their first and last moments, seconds; one interval remains of each."""
     times, keep, earlier = take.times, np.ones(len(take.times), bool), np.zeros(len(take.times))
     interval = float(np.median(np.diff(times)))

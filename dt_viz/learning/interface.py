@@ -18,7 +18,7 @@ STATES: tuple[State, ...] = get_args(State)
 
 
 @dataclass(frozen=True)
-class Choice:
+class StateChoice:
     """How far demonstrations that were left out are from what the others teach: mean Fréchet distances, metres."""
 
     plain: float
@@ -34,7 +34,7 @@ class Choice:
             f"{state} {1e3 * distance:.1f} mm ({distance / max(self.shifted_mean, ZERO):.2f} × the shifted mean)"
             for state, distance in (("plain", self.plain), ("augmented", self.augmented))
         )
-        return f"{self.num} demonstrations left out: {off}"
+        return f"{self.num} demonstration{'s' * (self.num != 1)} left out: {off}"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -51,7 +51,7 @@ class AnyImitation(ABC):
     warnings: tuple[str, ...] = ()
     reason: str = ""
     """Why it was learned in this state, where that was not asked for; see `dt_viz.learning.state`."""
-    choice: Choice | None = None
+    choice: StateChoice | None = None
     """What it was chosen by, where that was done by leaving demonstrations out."""
     labels: tuple[float, ...] | None = None
     """Label of each demonstration that was given; None without labels."""

@@ -12,7 +12,7 @@ from dt_viz.errors import FormatError
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.demonstrations import Demonstration, samples_of
-from dt_viz.learning.inspection import Inspection, PreparationSettings, Take, repair
+from dt_viz.learning.inspection import Inspection, PreparationSettings, Repaired, repair
 from dt_viz.metrics import arc_length, discrete_frechet, resample_by_arc_length
 from dt_viz.warning import in_millimetres
 
@@ -126,7 +126,7 @@ def prepare(demonstrations: Sequence[Demonstration], settings: PreparationSettin
         samples = samples_of(demonstrations)
     except FormatError as error:
         raise ImitationError(str(error)) from error
-    takes = [Take(own, *sample) for own, sample in zip(demonstrations, samples, strict=True)]
+    takes = [Repaired(own, *sample) for own, sample in zip(demonstrations, samples, strict=True)]
     for take in takes:
         if not arc_length(take.positions)[-1] > 0:
             take.leave_out("still", "never moves")
@@ -149,12 +149,12 @@ def prepare(demonstrations: Sequence[Demonstration], settings: PreparationSettin
     return Motions(tuple(kept), names, times, positions, goal, spread, inspections, repaired)
 
 
-def _spread(takes: Sequence[Take]) -> float:
+def _spread(takes: Sequence[Repaired]) -> float:
     points = np.concatenate([resample_by_arc_length(take.positions, 100) for take in takes])
     return float(np.sqrt(points.var(axis=0).sum()))
 
 
-def _common_goal(takes: Sequence[Take], spread: float, settings: PreparationSettings) -> Array:
+def _common_goal(takes: Sequence[Repaired], spread: float, settings: PreparationSettings) -> Array:
     """Find the goal (d,), which is given or where most takes end, and leave out those that end elsewhere."""
     ends = np.array([take.positions[-1] for take in takes])
     reach = settings.max_moved_end * spread
@@ -202,7 +202,7 @@ def _given_goal(given: Sequence[float], ends: Array, reach: float) -> Array:
     return goal
 
 
-def _no_common_goal(takes: Sequence[Take], ends: Array, reach: float) -> str:
+def _no_common_goal(takes: Sequence[Repaired], ends: Array, reach: float) -> str:
     """Say which takes end where, and how to choose."""
     left, groups = np.ones(len(ends), bool), []
     while left.any():
@@ -223,7 +223,7 @@ def _place(point: Array) -> str:
     return f"({', '.join(f'{x:.3g}' for x in point)}) m"
 
 
-def _lead_to_goal(take: Take, goal: Array, near: float) -> None:
+def _lead_to_goal(take: Repaired, goal: Array, near: float) -> None:
     """Move the end of a take to the goal, and let it begin away from it, at more than the distance `near`, metres."""
     take.positions = path = _end_moved(take.positions, goal)
     away = np.flatnonzero(np.linalg.norm(path - goal, axis=1) > near)

@@ -25,7 +25,7 @@ from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
 from dt_viz.learning.augmented import fit_augmented, with_found_patterns
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.imitation import Imitation, ImitationSettings, Progress, fit, fit_transform
-from dt_viz.learning.interface import STATES, AnyImitation, Choice, State
+from dt_viz.learning.interface import STATES, AnyImitation, State, StateChoice
 from dt_viz.learning.patterns import AugmentedSettings
 from dt_viz.learning.preparation import ImitationError, Motions, prepare
 from dt_viz.metrics import arc_length, discrete_frechet
@@ -106,7 +106,9 @@ def learn(
     return replace(fit_augmented(demonstrations, None, augmented, reason), choice=found)
 
 
-def leaving_out(motions: Motions, choice: ChoiceSettings, augmented: AugmentedSettings, progress: Progress) -> Choice:
+def leaving_out(
+    motions: Motions, choice: ChoiceSettings, augmented: AugmentedSettings, progress: Progress
+) -> StateChoice:
     """Follow motions by what the others teach in both states, in a few folds or until the plain one is clearly worse.
 
     Motions of all lengths are in each fold, in whichever order they come.
@@ -128,7 +130,7 @@ def leaving_out(motions: Motions, choice: ChoiceSettings, augmented: AugmentedSe
         if off[0].mean() > choice.hopeless * off[1].mean():
             break
     plain, remembering, shifted = (float(distance) for distance in off.mean(axis=1))
-    return Choice(plain, remembering, shifted, off.shape[1])
+    return StateChoice(plain, remembering, shifted, off.shape[1])
 
 
 def _plain(others: Motions, known: Motions, iterations: int, progress: Progress) -> Array:

@@ -107,8 +107,7 @@ class Arm:
         return tuple(replace(one, positions=placed(one.positions)) for one in demonstrations)
 
     def __repr__(self) -> str:
-        first, *_, last = self.robot.joint_names
-        return f"Arm({len(self.robot.joint_names)} joints, {first} to {last})"
+        return f"Arm({self.robot.title}: {self.robot.num_joints} joints, reach {self.robot.reach:.2f} m)"
 
     def follow(self, path: HandPath) -> JointPath:
         """The joints along a path of the hand.

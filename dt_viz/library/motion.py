@@ -17,6 +17,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial import KDTree
 
 from dt_viz.avoidance.registry import entry_of
 from dt_viz.avoidance.transform import Transform
@@ -89,6 +90,8 @@ class Motion:
         learned, lines = self._learned, [repr(self)]
         if self.reason:
             lines.append(f"{self.state} state: {self.reason}")
+        elif learned.imitation.choice:
+            lines.append(f"{self.state} state: {learned.imitation.choice}")
         paths = [path[:, : self.dimension] for path in learned.demonstrated.paths]
         for inspection, own, path in zip(self.inspections, learned.task.demonstrations, paths, strict=False):
             off = f"; the learned motion is up to {missed(path, own.positions)} off" if inspection.kept else ""
@@ -163,19 +166,26 @@ class Motion:
 
         Args:
             y: places, metres.
-            phase: part of the motion that is left, from 1 at its start to 0 at the goal; only of the augmented state,
-                which needs it.
-            start: (d,) where it began, metres; None is where the first demonstration does.
+            phase: part of the motion that is left in the augmented state, from 1 at its start to 0 at the goal; None
+                is, for each place, that of the nearest point of the motion, which jumps where two are as near.
+            start: (d,) where it began, metres; None is where the first demonstration does, without a phase any of them.
             label: of the motion; None takes that of the nearest demonstrated start.
 
         Raises:
-            FormatError: the phase is missing or not from 0 to 1, no demonstration has such a label, or places are not
-                d finite numbers each.
+            FormatError: the phase is not from 0 to 1, no demonstration has such a label, or places are not d finite
+                numbers each.
         """
         points = np.asarray(y, float)
         self.checked(points.reshape(-1, points.shape[-1] if points.ndim else 1), "y")
-        system = frozen(self.solution.system, self.rest(phase, start, label))
-        velocity = system.velocity(self.in_space(points.reshape(-1, self.dimension)))
+        places, system = self.in_space(points.reshape(-1, self.dimension)), self.solution.system
+        if phase is not None or self.state == "plain":
+            velocity = frozen(system, self.rest(phase, start, label)).velocity(places)
+        else:
+            velocity, states = np.empty_like(places), self._states_along(start, label)
+            nearest = KDTree(states[:, :NUM_COORDINATES]).query(places)[1]
+            for k in np.unique(nearest):
+                at = nearest == k
+                velocity[at] = frozen(system, states[k, NUM_COORDINATES:]).velocity(places[at])
         return velocity[:, : self.dimension].reshape(points.shape)
 
     def phase_rate(self, phase: float, start: ArrayLike | None = None, label: float | None = None) -> float:
@@ -276,12 +286,22 @@ class Motion:
         """The states (R, k) in which motions from places (R, d) begin."""
         return self.solution.rays.base.states(self.in_space(places), label)
 
+    def _states_along(self, start: ArrayLike | None, label: float | None) -> Array:
+        """The states (N, k) along the motion from a start (d,), or along those of the demonstrations with a label."""
+        system, rays = self.solution.system, self.solution.rays
+        if start is not None:
+            began = self._states(self.checked(np.asarray(start, float)[None], "start"), label)
+            rays = Rays(system.transform.forward(began), system.base)
+        elif label is not None:
+            rays = replace(rays, z0=rays.z0[self.labelled(label)])
+        fraction = np.linspace(0.0, 1.0, NUM_SAMPLES)
+        index = np.repeat(np.arange(len(rays.z0)), NUM_SAMPLES)
+        return system.transform.inverse(rays.at(index, np.tile(fraction, len(rays.z0))))
+
     def rest(self, phase: float | None, start: ArrayLike | None, label: float | None) -> Array:
-        """Find what the state of a motion from a start (d,) consists of besides the place, at a phase."""
+        """Find what the state of a motion from a start (d,) has besides the place, at a phase; None is at its start."""
         began = self._learned.task.starts[0, : self.dimension] if start is None else np.asarray(start, float)
         rest = self._states(self.checked(began[None], "start"), label)[0, NUM_COORDINATES:]
-        if phase is None and len(rest):
-            raise FormatError("phase", "none", "a number from 0 to 1: this motion was learned in the augmented state")
         if phase is not None:
             check_between("phase", phase, 0.0, 1.0)
             rest[:1] *= phase

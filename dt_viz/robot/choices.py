@@ -29,7 +29,7 @@ AXES = {"x": (1.0, 0.0), "-x": (-1.0, 0.0), "y": (0.0, 1.0), "-y": (0.0, -1.0)}
 
 
 @dataclass(frozen=True)
-class ChoiceSettings:
+class ArmSearchSettings:
     """Settings of what is found of an arm; lengths are parts of its reach."""
 
     pitch: float = 0.8
@@ -86,7 +86,7 @@ def find_front(
     ranges: Ranges,
     given: str | Sequence[float] | None,
     home: Array | None,
-    settings: ChoiceSettings,
+    settings: ArmSearchSettings,
 ) -> tuple[Array, str]:
     """Find the horizontal unit vector (2,) ahead of the arm in the base frame of its URDF, and say why.
 
@@ -137,7 +137,7 @@ def find_touching(
     meshes: Sequence[LinkMesh],
     ranges: Ranges,
     semantic: Element | None,
-    settings: ChoiceSettings,
+    settings: ArmSearchSettings,
 ) -> tuple[frozenset[frozenset[str]], str]:
     """Find pairs of links, besides neighbours, that may touch, by name, and say why.
 
@@ -176,7 +176,12 @@ class HomeSearch:
     """
 
     def __init__(
-        self, kinematics: Kinematics, body: BodyPoints, solids: CollisionModel, ranges: Ranges, settings: ChoiceSettings
+        self,
+        kinematics: Kinematics,
+        body: BodyPoints,
+        solids: CollisionModel,
+        ranges: Ranges,
+        settings: ArmSearchSettings,
     ) -> None:
         self._arm, self._body, self._solids, self._ranges, self._settings = kinematics, body, solids, ranges, settings
         self._shoulder = kinematics.forward_kinematics(np.zeros(kinematics.num_joints))[1][1]
@@ -285,7 +290,7 @@ def find_home(
     return q, "; ".join(["searched for", *told, *([f"but {objection}"] if objection else [])])
 
 
-def find_levers(kinematics: Kinematics, home: Array, lower: Array, upper: Array, settings: ChoiceSettings) -> Array:
+def find_levers(kinematics: Kinematics, home: Array, lower: Array, upper: Array, settings: ArmSearchSettings) -> Array:
     """Compute how far the hand moves for each joint's turning, (n,) m/rad, root mean square over postures near home."""
     near = np.clip(home + settings.spread * np.random.default_rng(0).normal(size=(400, len(home))), lower, upper)
     moved = np.linalg.norm(kinematics.chain(near.T).position_jacobian(), axis=1)

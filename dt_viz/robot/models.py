@@ -18,7 +18,7 @@ from dt_viz.memo import Memo
 from dt_viz.robot import arm_cache
 from dt_viz.robot.body_points import BodyPoints
 from dt_viz.robot.choices import (
-    ChoiceSettings,
+    ArmSearchSettings,
     HomeSearch,
     Ranges,
     count_fixed,
@@ -261,7 +261,7 @@ class _Given:
     package_dirs: tuple[Path, ...]
     locked: Sequence[str] | Mapping[str, float] | None = None
     levers: tuple[float, ...] | None = None
-    choice: ChoiceSettings = field(default=ChoiceSettings())
+    choice: ArmSearchSettings = field(default=ArmSearchSettings())
     cover: CoverSettings = field(default=CoverSettings())
 
     def load(self, progress: Progress | None) -> Robot:
