@@ -270,7 +270,7 @@ def test_where_no_way_is_free_that_is_said_and_the_exact_flow_is_made_once_and_i
         return solver(*arguments, coarse=coarse)
 
     monkeypatch.setattr(push.arm, "_solver", recorded)
-    solution = push.avoiding(Sphere((0.03, -0.13, 0.4), 0.14))
+    solution = push.avoiding(Sphere((0.03, -0.13, 0.4), 0.22))
     assert made == [True] * (len(made) - 1) + [False] and len(made) > 2
     assert not solution.cleared
     assert solution.duration <= MAX_DURATION
