@@ -92,7 +92,7 @@ def _serve(options: argparse.Namespace) -> int:
             max_sessions=options.max_sessions,
             allowed=options.allow_origin,
         )
-    except (DataError, ImitationError, AddressError, GateError) as error:
+    except (DataError, ImitationError, AddressError, GateError, FileNotFoundError) as error:
         print(f"{PROG}: {error}", file=sys.stderr)
         return 2
     host = f"[{server.host}]" if ":" in server.host else server.host
@@ -109,7 +109,7 @@ def _serve(options: argparse.Namespace) -> int:
 
 
 def _robot(options: argparse.Namespace) -> Robot:
-    """Load the arm that is asked for. Raises DataError where it cannot be used."""
+    """Load the arm that is asked for. Raises DataError where it cannot be used, FileNotFoundError where it is gone."""
     from dt_viz.robot.models import load_arm, robot_from_urdf  # noqa: PLC0415
 
     bar = _Bar("Getting to know the arm, once")
