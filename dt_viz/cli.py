@@ -46,6 +46,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _serve(options: argparse.Namespace) -> int:
+    if unused := _unused(options):
+        print(f"{PROG}: {unused}", file=sys.stderr)
+        return 2
     # several visitors share the cores; BLAS threads for small matrices cost more than they gain
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -69,7 +72,9 @@ def _serve(options: argparse.Namespace) -> int:
         if options.files:
             how = {name: getattr(options, name) for name in ("rate", "unit", "columns", "topic")}
             own = own_task(load_demonstrations(options.files, **how, arm=robot))
-            tasks = {OWN: TaskEntry(own.title, lambda: own), **tasks}
+            entry = {OWN: TaskEntry(own.title, lambda: own)}
+            is_drawing = own.demonstrations[0].dimension == 2
+            tasks = {**(in_reach(entry, robot) if is_drawing else entry), **tasks}
         begin = options.task or (OWN if options.files else "draw_s")
         if begin not in tasks:
             print(f"{PROG}: --task: found {begin!r}; accepted: {', '.join(tasks)}", file=sys.stderr)
@@ -106,6 +111,18 @@ def _serve(options: argparse.Namespace) -> int:
         leaving.set()
         server.close()
         preparing.join()
+
+
+def _unused(options: argparse.Namespace) -> str:
+    """Say which options do nothing without another one; empty where there is none."""
+    for names, needs, given in (
+        (("end_effector", "home", "front", "srdf", "package_dir"), "--urdf", options.urdf),
+        (("rate", "unit", "columns", "topic"), "FILE", options.files),
+    ):
+        unused = [f"--{name.replace('_', '-')}" for name in names if getattr(options, name) not in (None, [])]
+        if unused and not given:
+            return f"{', '.join(unused)}: found without {needs}; accepted: with {needs}"
+    return ""
 
 
 def _robot(options: argparse.Namespace) -> Robot:

@@ -155,6 +155,8 @@ def test_handlers_of_signals_are_as_before_when_it_returns(capsys):
         ("evaluate around --task nothing --out a.npz", 2, "dt-viz evaluate around: --task: found 'nothing'"),
         ("--arm pr2", 2, "name: found 'pr2'; accepted: jaco, panda, ur3"),
         ("--urdf nowhere.urdf", 2, "nowhere.urdf: file: found No such file"),
+        ("--arm panda --home=0,1 --srdf x", 2, "--home, --srdf: found without --urdf; accepted: with --urdf"),
+        ("--rate 20", 2, "--rate: found without FILE"),
         ("--home 1,a", 2, "argument --home: found '1,a'; accepted: angles in rad"),
         ("--arm panda --urdf arm.urdf", 2, "--urdf: not allowed with argument --arm"),
         ("--allow-origin demo.org", 2, "argument --allow-origin: found 'demo.org'; accepted: http://"),

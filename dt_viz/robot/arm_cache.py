@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import logging
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-FORMAT = 1
+FORMAT = 2
 """Version of what is found of an arm and of its file; raised with every change, so that older files are not used."""
 MAX_BYTES = 500 * 10**6
 """Largest number of bytes that a file unpacks to."""
@@ -107,12 +106,10 @@ def from_arrays(arrays: Mapping[str, np.ndarray], given: Mapping[str, Any]) -> R
             VisualMesh(*parts, colour) for parts, colour in zip(_meshes(arrays, "visual"), colours, strict=True)
         ),
     )
-    num = robot.num_joints
-    if any(
-        len(getattr(robot, field.name)) != num
-        for field in fields(robot)
-        if field.name in ("lower", "upper", "home", "levers", "joint_names")
-    ):
+    lengths = {
+        len(getattr(robot, name)) for name in ("joint_names", "lower", "upper", "velocity_limits", "home", "levers")
+    }
+    if lengths != {robot.num_joints}:
         raise ValueError("arrays of different lengths")
     return robot
 

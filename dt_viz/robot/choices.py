@@ -72,9 +72,10 @@ class Ranges(NamedTuple):
 
     @classmethod
     def of(cls, lower: Array, upper: Array) -> Ranges:
-        """Cut limits off at one turn."""
+        """Cut limits off at one turn, the one that is nearest to 0."""
         wide = ~(upper - lower < 2 * np.pi)
-        return cls(np.where(wide, -np.pi, lower), np.where(wide, np.pi, upper))
+        middle = np.clip(0.0, lower + np.pi, upper - np.pi)
+        return cls(np.where(wide, middle - np.pi, lower), np.where(wide, middle + np.pi, upper))
 
     def random(self, rng: np.random.Generator, num: int) -> Array:
         """Draw postures (num, n) that leave a tenth of each range at its ends."""
@@ -211,7 +212,7 @@ class HomeSearch:
         tilt = chain.direction - np.array([0.0, -np.cos(settings.pitch), -np.sin(settings.pitch)])[:, None]
         bounded = upper - lower < 2 * np.pi
         middle = ((((q - (lower + upper) / 2) / (upper - lower)) ** 2) * bounded).sum(axis=1)
-        moving = self._body.joint > 0
+        moving = self._body.joint >= self._solids.num_fixed
         heights = (self._body.of_chain(chain)[moving, 2] - self._body.radius[moving, None]).min(axis=0)
         aside = np.abs(chain.origins[:, 0] - self._shoulder[0]).mean(axis=0)
         return (
@@ -247,6 +248,7 @@ def semantic_homes(semantic: Element | None, joint_names: Sequence[str]) -> list
         values = {
             str(joint.get("name")): float(numbers(joint, "value", "SRDF: group_state", (0.0,))[0])
             for joint in state.iterfind("joint")
+            if joint.get("name") in joint_names
         }
         if set(joint_names) <= set(values):
             found.append((state.get("name", ""), np.array([values[name] for name in joint_names])))

@@ -42,6 +42,8 @@ RESOLUTION = 3.5e-3
 """Largest error of a reported depth in an obstacle that is no ball, metres; 1.5 mm on a link's surface."""
 CERTAIN = 3e-3
 """Depth, metres, greater than the error of an obstacle's signed distance: a deeper point surely is inside."""
+FLAT = 1e-6
+"""Thickness up to which a link counts as flat, metres."""
 GROUP_SIZE = 0.02
 """Size of the cells into which these points are grouped, metres."""
 BALL_SIZE = 0.06
@@ -115,7 +117,7 @@ class Link:
         half_size: (3,) half the sides of that box, metres.
         radius: radius of the ball around that centre that holds the mesh, metres.
         corners: (8, 3) corners of that box, metres.
-        hull: (H, 3) vertices of the convex hull, metres.
+        hull: (H, 3) vertices of the convex hull, all of a flat link, metres.
     """
 
     def __init__(self, mesh: LinkMesh, name: str) -> None:
@@ -129,8 +131,10 @@ class Link:
         self.radius = float(np.linalg.norm(mesh.vertices - self.centre, axis=1).max())
         signs = np.array(np.meshgrid(*3 * [[-1.0, 1.0]])).reshape(3, -1).T
         self.corners = self.centre + signs * self.half_size
-        self.surface.buildConvexHull(False, "Qt")
-        self.hull = np.array(self.surface.convex.points())
+        self.hull = mesh.vertices
+        if np.linalg.matrix_rank(mesh.vertices - self.centre, tol=FLAT) == 3:  # qhull crashes on what is flat
+            self.surface.buildConvexHull(False, "Qt")
+            self.hull = np.array(self.surface.convex.points())
 
     @cached_property
     def groups(self) -> _Groups:

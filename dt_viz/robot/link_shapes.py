@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 SHAPES = ("box", "cylinder", "sphere", "mesh")
 COLOURED = (".dae", ".obj", ".glb", ".gltf", ".ply")
 """Suffixes of files of meshes that have colours of their own."""
+LARGEST = 50.0
+"""Largest extent of a link, in reaches of the arm: a mesh in millimetres is a thousand times too large."""
 SHORTEST_HAND = 0.03
 """Least distance of the tool from the last joint for that to be the hand's direction, metres; else that is its z."""
 
@@ -155,13 +157,20 @@ def read_shapes(text: str, chain: ArmChain) -> Shapes:
     for name, shape in _geometry(model, text, pin.GeometryType.COLLISION):
         mesh = LinkMesh(name, shape.parentJoint - 1, *_placed(*_triangles(shape.geometry), shape, before))
         solids[name] = _joined(solids[name], mesh) if name in solids else mesh
-    if not solids:
-        raise FormatError("links", "neither collision shapes nor visuals", f"links with shapes: {', '.join(SHAPES)}")
+    if not any(mesh.joint > 0 for mesh in solids.values()):
+        found = "neither collision shapes nor visuals beyond the first joint"
+        raise FormatError("links", found, f"links with shapes: {', '.join(SHAPES)}")
+    for name, mesh in solids.items():
+        if (size := float(np.ptp(mesh.vertices, axis=0).max())) > LARGEST * kinematics.reach:
+            accepted = 'metres; of a mesh in millimetres: <mesh … scale="0.001 0.001 0.001"/>'
+            raise FormatError(f"link {name}", f"{size:.3g} m across", accepted)
     visuals = []
     for _, shape in _geometry(model, text, pin.GeometryType.VISUAL):
         for name, vertices, faces, colour in _coloured(shape):
             visuals.append(VisualMesh(name, shape.parentJoint - 1, *_placed(vertices, faces, shape, before), colour))
     by_joint = sorted(solids.values(), key=lambda mesh: mesh.joint)
+    if not any(mesh.joint > 0 for mesh in visuals):  # what is not drawn is shown by what collides
+        visuals += [VisualMesh(mesh.name, mesh.joint, mesh.vertices, mesh.faces) for mesh in by_joint]
     return Shapes(kinematics, tuple(by_joint), tuple(visuals))
 
 

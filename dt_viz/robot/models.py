@@ -280,7 +280,8 @@ class _Given:
             chain.tool,
         )
         told = [text.encode(), repr(chosen).encode(), self.srdf.read_bytes() if self.srdf else b""]
-        key = arm_cache.digest([*told, *(file.read_bytes() for file in files)])
+        materials = (path for file in files if file.suffix.lower() == ".obj" for path in file.parent.glob("*.mtl"))
+        key = arm_cache.digest([*told, *(file.read_bytes() for file in (*files, *sorted(materials)))])
         stored = default_cache_folder() / "arms" / f"{key}.npz"
         names = {"name": name, "title": self.title or name, "urdf": self.urdf, "package_dirs": self.package_dirs}
         robot = arm_cache.read(stored, names)

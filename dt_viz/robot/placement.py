@@ -19,6 +19,11 @@ REFERENCE_SHOULDER = (0.0, 0.0, 0.28)
 """Place of the JACO's shoulder, metres, which tasks were made for."""
 
 
+def is_jaco(robot: Robot) -> bool:
+    """Return whether an arm has the JACO's size and shoulder, for which tasks and scenes of the paper were made."""
+    return robot.size == 1.0 and tuple(robot.shoulder) == REFERENCE_SHOULDER
+
+
 @dataclass(frozen=True)
 class PlacementSettings:
     """Settings of where a task is placed; lengths are parts of the arm's reach."""

@@ -61,6 +61,8 @@ class PaperScene:
     make: Callable[[Task], Scenario]
     view: Mapping[str, Any] = field(default_factory=dict)
     """Fields of `View` that differ from the defaults."""
+    of_jaco: bool = False
+    """Whether its places are the JACO's, so that it is not offered with another arm."""
 
     @property
     def tasks(self) -> frozenset[str]:
@@ -185,7 +187,9 @@ def _comparison(name: str, title: str, task: str) -> PaperScene:
     """Return a scene of ours beside other methods (fig. 6)."""
     line = "Ours is orange. Scores and curves of all are in “Compare”; drag the sphere."
     avoidance = ArmAvoidance(Sphere(FIG_6_PLACES[task], FIG_6_DIAMETER))
-    return PaperScene(name, f"Fig. 6: {title}", line, task, lambda task: _avoiding(task, avoidance), view=FIG_6)
+    return PaperScene(
+        name, f"Fig. 6: {title}", line, task, lambda task: _avoiding(task, avoidance), FIG_6, of_jaco=True
+    )
 
 
 def _into_pot(name: str, index: int) -> PaperScene:
@@ -198,6 +202,7 @@ def _into_pot(name: str, index: int) -> PaperScene:
         "drop_pots",
         lambda task: _biased(task, BiasPoint(release(task.pots[index]), moves_goal=True)),
         view=POSES,
+        of_jaco=True,
     )
 
 
@@ -305,6 +310,12 @@ SCENES: Mapping[str, PaperScene] = {
 """Scenes by name, in the order of the figures; see `offered`."""
 
 
-def offered(tasks: Container[str]) -> tuple[PaperScene, ...]:
-    """Return the scenes whose tasks are all among these: those of the LASA data only where the user has them."""
-    return tuple(scene for scene in SCENES.values() if all(name in tasks for name in scene.tasks))
+def offered(tasks: Container[str], *, jaco: bool = True) -> tuple[PaperScene, ...]:
+    """Return the scenes whose tasks are all among these: those of the LASA data only where the user has them.
+
+    Args:
+        tasks: names of the tasks that there are.
+        jaco: whether they are for the JACO; scenes with places of its own are left out otherwise.
+    """
+    known = (scene for scene in SCENES.values() if all(name in tasks for name in scene.tasks))
+    return tuple(scene for scene in known if jaco or not scene.of_jaco)

@@ -93,6 +93,7 @@ class Task:
             slice=replace(self.slice, centre=mapped(self.slice.centre), half_size=(scale * width, scale * height)),
             camera=(eye, target),
             obstacle_position=as_point(mapped(self.obstacle_position)),
+            hint="Drag the sphere into the way." if self.objects or self.pots else self.hint,
             pots=(),
             objects=(),
         )

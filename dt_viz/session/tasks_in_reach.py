@@ -8,7 +8,7 @@ from dataclasses import replace
 from functools import partial
 
 from dt_viz.robot.inverse_kinematics import UnreachableError
-from dt_viz.robot.placement import place
+from dt_viz.robot.placement import is_jaco, place
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.tasks import Task, TaskEntry
 
@@ -20,7 +20,7 @@ def in_reach(tasks: Mapping[str, TaskEntry], robot: Robot) -> Mapping[str, TaskE
 
     One that the arm can follow nowhere stays where it is: a log line says why, and the page what is out of reach.
     """
-    if robot.name == "jaco":
+    if is_jaco(robot):
         return tasks
     return {name: replace(entry, load=partial(_placed, entry, robot)) for name, entry in tasks.items()}
 

@@ -9,6 +9,7 @@ from typing import Any
 import viser
 
 from dt_viz.avoidance.avoidance import Space
+from dt_viz.robot.placement import is_jaco
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.paper_scenes import SCENES, PaperScene, offered
 from dt_viz.scenario.scenario import Scenario
@@ -64,7 +65,7 @@ class ControlPanel:
         """
         self._notify, self._tripod, self._titles = notify, tripod, dict(titles)
         self._notified: Message | None = None
-        self._scenes = {scene.title: scene for scene in offered(self._titles)}
+        self._scenes = {scene.title: scene for scene in offered(self._titles, jaco=is_jaco(robot))}
         self.bindings = bindings = Bindings()
         self.presentation = Presentation(gui, self._turn, lambda alone: tripod.reframe(alone=alone))
         bindings.show(self._title, self.presentation.entitle)

@@ -131,8 +131,10 @@ def test_links_that_may_touch_are_few_and_the_others_are_apart_in_some_postures(
 
 
 @each_arm
-def test_the_front_is_ahead_and_the_frame_is_the_urdfs_turned_about_the_vertical(name):
+def test_the_frame_is_the_urdfs_turned_about_the_vertical_and_the_hand_is_ahead_at_home(name):
     robot = load_arm(name)
+    x, y, _ = robot.end_effector(robot.home) - robot.shoulder
+    assert y < -0.1 * robot.reach and abs(x) < -y
     np.testing.assert_allclose(robot.base @ robot.base.T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(robot.base[2], [0, 0, 1], atol=0)
     np.testing.assert_allclose(np.linalg.det(robot.base), 1, atol=1e-12)
@@ -331,3 +333,51 @@ def test_hollows_count_as_solid_unless_they_are_open_to_more_sides_than_one():
         assert spheres[:, 3].max() > 0.05  # in the middle
     assert open_to_two[:, 3].max() < 0.02  # only the walls
     assert len(open_to_two) > 2 * len(closed)
+
+
+def bounded(text, low, high):
+    """An arm whose joints have other limits."""
+    return text.replace('lower="-2" upper="2"', f'lower="{low}" upper="{high}"')
+
+
+@pytest.mark.parametrize("limits", [(0.5, 6.9), (0.0, 6.2832), (-7.0, -0.6), (-6.3, 6.3)])
+def test_home_is_within_limits_wherever_they_are(tmp_path, limits):
+    robot = robot_from_urdf(write(tmp_path, bounded(urdf(5), *limits)))
+    assert (robot.home >= limits[0]).all() and (robot.home <= limits[1]).all()
+
+
+@pytest.mark.parametrize("sizes", ["0.1 0.1 0", "0.1 0 0", "0.05 0.05 1e-9"])
+def test_flat_links_are_measured_like_others(tmp_path, sizes):
+    plate = f'<geometry><box size="{sizes}"/></geometry>'
+    text = urdf(4).replace('<link name="tcp"/>', link("tcp", plate))
+    robot = robot_from_urdf(write(tmp_path, text))
+    assert np.isfinite(robot.collision.nearest_to_table(robot.home[None]).distance)
+
+
+def test_what_is_not_drawn_is_shown_by_what_collides(tmp_path):
+    robot = robot_from_urdf(write(tmp_path, urdf(4)))  # its boxes are for collisions alone
+    assert [mesh.name for mesh in robot.visuals] == [mesh.name for mesh in robot.meshes]
+
+
+def test_states_of_other_groups_do_not_matter(tmp_path):
+    semantic = write(
+        tmp_path,
+        '<robot name="small"><group_state name="standing" group="base"><joint name="virtual" value="0 0 0 0 0 0 1"/>'
+        "</group_state></robot>",
+        "arm.srdf",
+    )
+    assert semantic_homes(read_semantic(semantic), ["j0", "j1"]) == []
+
+
+def test_a_material_that_has_changed_is_read_again(tmp_path):
+    box = trimesh.creation.box((0.06, 0.06, 0.2))
+    mesh, material = tmp_path / "box.obj", tmp_path / "box.mtl"
+    lines = [f"v {x} {y} {z}" for x, y, z in box.vertices] + [f"f {a} {b} {c}" for a, b, c in box.faces + 1]
+    mesh.write_text("\n".join(["mtllib box.mtl", "usemtl paint", *lines]))
+    drawn = link("l3", f'<geometry><mesh filename="{mesh}"/></geometry>', "visual")
+    path = write(tmp_path, urdf(4).replace(link("l3"), drawn))
+    found = []
+    for paint in ("1 0 0", "0 1 0"):
+        material.write_text(f"newmtl paint\nKd {paint}\n")
+        found.append([each.colour for each in robot_from_urdf(path).visuals if each.name == "box.obj"])
+    assert found == [[(255, 0, 0)], [(0, 255, 0)]]

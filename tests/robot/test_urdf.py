@@ -95,7 +95,7 @@ def test_all_kinds_of_shapes_are_read_and_visuals_where_there_is_nothing_else(tm
             description, chain = chain_of(write(tmp_path, text))
             found = read_shapes(reduced(description, chain, ()).text, chain)
             assert [mesh.name for mesh in found.meshes] == ["l0", "l1", "l2", "l3"]
-            assert len(found.visuals) == (4 if tag == "visual" else 0)
+            assert [mesh.joint for mesh in found.visuals] == [-1, 0, 1, 2]  # what collides where nothing is drawn
             corners = found.meshes[1].vertices[found.meshes[1].faces]
             enclosed = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
             assert 0.98 * volume < enclosed < 1.001 * volume
@@ -116,6 +116,11 @@ BAD = {
     "an external entity": ('<!DOCTYPE r [<!ENTITY a SYSTEM "file:///etc/passwd">]><robot>&a;</robot>', ["entities"]),
     "an empty robot": ("<robot/>", ["links", "none", "xacro"]),
     "no shapes": (urdf(4, shape="").replace(BOX, ""), ["neither collision shapes nor visuals"]),
+    "shapes of the base alone": (
+        urdf(4, shape="").replace('<link name="l0"></link>', link("l0")),
+        ["beyond the first joint", "links with shapes"],
+    ),
+    "millimetres": (urdf(4, shape='<geometry><box size="60 60 200"/></geometry>'), ["200 m across", 'scale="0.001']),
     "a missing mesh": (urdf(4, shape=MISSING), ["package://mine/meshes/hand.stl", "package_dirs="]),
     "another shape": (urdf(4, shape='<geometry><capsule radius="1" length="1"/></geometry>'), ["capsule", "mesh"]),
     "a prismatic joint": (

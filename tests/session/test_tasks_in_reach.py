@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dt_viz.robot.placement import follows
+from dt_viz.robot.placement import follows, is_jaco
+from dt_viz.scenario.paper_scenes import offered
 from dt_viz.scenario.tasks import TASKS, Task, TaskEntry
 from dt_viz.session.tasks_in_reach import in_reach
 
@@ -42,3 +43,18 @@ def test_a_task_out_of_every_reach_stays_and_is_said(robot, caplog):
     assert found is far
     assert "Far: " in caplog.text
     assert "cannot follow the task anywhere" in caplog.text
+
+
+def test_an_arm_is_the_jaco_by_its_shape_not_by_its_name(robot):
+    assert is_jaco(replace(robot, name="mine"))
+    other = replace(shorter(robot, 0.5), name="jaco")
+    assert not is_jaco(other)
+    assert in_reach(TASKS, other) is not TASKS
+
+
+def test_every_scene_that_another_arm_is_offered_can_be_made(robot):
+    tasks = in_reach(TASKS, shorter(robot, 0.5))
+    scenes = offered(tasks, jaco=False)
+    assert {scene.name for scene in offered(tasks)} - {scene.name for scene in scenes} >= {"left_pot", "others_push"}
+    for scene in scenes:
+        assert scene.scenario(tasks[scene.task]()).task == scene.task
