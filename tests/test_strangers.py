@@ -280,3 +280,19 @@ def test_four_coordinates_are_no_place_in_the_plane(drawing):
 def test_a_point_before_the_plane_is_still_said(drawing):
     above = replace(dt.BiasPoint((0.15, 0.05, 0.0)), position=(0.15, 0.05, 0.1))
     assert Kind.OFF_PLANE in {warning.kind for warning in drawing.stack(above).certificates().warnings}
+
+
+def test_milliseconds_are_asked_about():
+    with pytest.raises(dt.DataError, match=r"a duration of .* is it in milliseconds"):
+        dt.fit((np.linspace(0, 5000, len(PATH)), PATH))
+
+
+def test_an_end_stays_where_it_is_unless_ends_are_moved_and_a_goal_may_be_an_array():
+    goal = PATH[-1]
+    settings = dt.PreparationSettings(goal=goal, move_ends=False, smooth_jitter=False)
+    noisy = PATH + np.random.default_rng(0).normal(0, 2e-3, PATH.shape)
+    with pytest.warns(dt.DemonstrationWarning):
+        motion = dt.fit(
+            [PATH, PATH, noisy], rate=25, settings=dt.ImitationSettings(preparation=settings), state="augmented"
+        )
+    assert [each.kept for each in motion.inspections] == [True, True, False]

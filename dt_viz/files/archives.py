@@ -28,6 +28,12 @@ def read_npz(file: BinaryIO, source: Path, _options: ReadOptions) -> Iterator[Ta
     """Read named arrays; ``times_i``, ``positions_i`` and ``name_i``, as this program writes them, are metres."""
     arrays = arrays_of(file, max_bytes=LIMITS.bytes)
     ours = all(re.fullmatch(r"(?:times|positions|orientations_wxyz|name)_\d+", key) for key in arrays)
+    timed, placed = (
+        {key.rpartition("_")[2] for key in arrays if key.startswith(f"{part}_")} for part in ("times", "positions")
+    )
+    if ours and timed and placed and timed != placed:
+        number = min(timed ^ placed)
+        raise FormatError("arrays", f"only one of times_{number} and positions_{number}", "both")
     for table in tables_of(arrays, source.stem):
         yield Table(table.name, table.columns, units={"length": 1.0, "time": 1.0} if ours else {})
 
@@ -112,8 +118,10 @@ def read_parquet(content: BinaryIO, source: Path, options: ReadOptions) -> Itera
             values = (column.flatten() if "list" in kinds[name] else column).to_numpy(zero_copy_only=False)
             size += values.size
             check_at_most("file", size, LIMITS.numbers, "numbers")
-            whole = len(values) % len(column) == 0 and values.dtype.kind in "iuf"
-            parts[name].append(values.reshape(len(column), -1) if "list" in kinds[name] and whole else values.copy())
+            whole = "list" in kinds[name] and values.dtype.kind in "iuf"
+            if whole and len(imported("pyarrow.compute", "parquet").list_value_length(column).unique()) > 1:
+                raise FormatError(f"column {name!r}", "lists of different lengths", "one length in all rows")
+            parts[name].append(values.reshape(len(column), -1) if whole else values.copy())
     columns = {name: np.concatenate(parts.pop(name)) for name in names if parts[name]}
     imported("pyarrow", "parquet").default_memory_pool().release_unused()
     yield Table(source.stem, columns, unused=tuple(name for name in kinds if name not in columns))

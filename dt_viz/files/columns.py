@@ -109,7 +109,7 @@ def role_of(name: str) -> Role | None:
     else:
         unit = ""
     if "_".join(words) in RATES:
-        return Role("rate")
+        return Role("rate", tuple(words), unit=unit)
     label = [word for word in words if word not in {"id", "index", "idx", "number", "no", "num", "name"}]
     if len(label) == 1 and label[0] in LABELS:
         return Role("label", rank=LABELS.index(label[0]))

@@ -33,6 +33,8 @@ class TakeLimits:
 
 
 LIMITS = TakeLimits()
+EMPTY = ("", "na", "nan", "none", "null")
+"""Words in cells without a number."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +122,11 @@ def read_text(file: BinaryIO, source: Path, options: ReadOptions) -> Iterator[Ta
     wanted = [not names or role_of(names[k]) is not None or names[k].lower() in lower for k in range(width)]
     labels: dict[str, float] = {}
     label = [bool(names) and _is_label(names[k], options) for k in range(width)]
-    used = [k for k in range(width) if wanted[k] and (label[k] or _is_number(first[k], delimiter))]
+    used = [
+        k
+        for k in range(width)
+        if wanted[k] and (label[k] or first[k].lower() in EMPTY or _is_number(first[k], delimiter))
+    ]
     max_rows = LIMITS.numbers // max(len(used), 1)
     fields = [(f"f{k}", "f8" if k in used else "U1") for k in range(width)]
     converters: Any = {k: lambda cell: labels.setdefault(cell.strip(), len(labels)) for k in used if label[k]}

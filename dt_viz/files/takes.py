@@ -181,7 +181,11 @@ def _stacked(columns: Mapping[str, np.ndarray], names: Sequence[str], rows: Rows
 def _units_of(found: Layout) -> dict[str, float]:
     """Sizes of the units that the names of columns end in."""
     named = [role.unit for name in (found.time, *found.positions, *found.joints) if (role := role_of(name))]
-    return dict(UNITS[unit] for unit in named if unit)
+    units: dict[str, float] = {}
+    for kind, size in (UNITS[unit] for unit in named if unit):
+        if units.setdefault(kind, size) != size:
+            raise FormatError("columns", f"several units of one {kind}", "one unit for each kind of quantity")
+    return units
 
 
 def _times(columns: Mapping[str, np.ndarray], found: Layout, options: ReadOptions) -> np.ndarray | None:
@@ -208,7 +212,9 @@ def _even(
     rate = options.rate
     if rate is None and found.rate and columns[found.rate].size:
         rate = float(columns[found.rate].flat[0])
-        rate = 1 / rate if rate and found.rate.lower().endswith("dt") else rate
+        role = role_of(found.rate)
+        if rate and role is not None and role.group == ("dt",):
+            rate = 1 / (rate * UNITS[role.unit or "s"][1])
     if rate is None or not 0 < rate < np.inf:
         rate = max(num - 1, 1) / UNTIMED
         notes[
@@ -251,18 +257,22 @@ def _unit_quaternions(turns: np.ndarray) -> np.ndarray | None:
     return turns
 
 
-def in_si_units(takes: Sequence[Take]) -> tuple[list[Take], str]:
+def in_si_units(takes: Sequence[Take], num_joints: int | None = None) -> tuple[list[Take], str]:
     """Bring takes of one or several files into metres, seconds and radians.
 
     Units that the files do not say are recognised over all takes: coordinates beyond any arm's reach, steps in time
     that no recorder has, and angles of more than two turns are in smaller units.
+
+    Args:
+        takes: of all files.
+        num_joints: number of the arm's joints, the first columns of angles; what follows is no angle. None is all.
 
     Returns:
         The takes, whose places or angles may have been changed in place, and a note if units were recognised.
     """
     recognised = {}
     lengths = [take.positions for take in takes if take.positions is not None and "length" not in take.units]
-    angles = [take.joints for take in takes if take.joints is not None and "angle" not in take.units]
+    angles = [take.joints[:, :num_joints] for take in takes if take.joints is not None and "angle" not in take.units]
     times = [take.times for take in takes if len(take.times) > 1 and "time" not in take.units]
     largest, widest = _largest(lengths), _largest(angles)
     if largest > MAX_REACH:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -93,10 +94,17 @@ def _tables(tree: Any, name: str) -> Iterator[Table]:  # noqa: ANN401 - condense
     if isinstance(tree, Mapping):
         yield from _of_mapping(tree, name)
     elif isinstance(tree, list):
-        for k, item in enumerate(tree):
-            yield from _tables(item, f"{name} {k}" if len(tree) > 1 else name)
+        takes = [list(_tables(item, f"{name} {k}" if len(tree) > 1 else name)) for k, item in enumerate(tree)]
+        if any(takes) and not all(takes):
+            raise FormatError(f"take {takes.index([]) + 1}", "no places", ACCEPTED)
+        yield from itertools.chain.from_iterable(takes)
     elif tree.dtype.kind in "iuf" and tree.ndim in (2, 3):
         yield from _several({"": _upright(tree, None)}, name)
+
+
+def _lettered(arrays: Mapping[str, np.ndarray]) -> bool:
+    """Return whether arrays are takes a, b, …, which are no columns."""
+    return len(arrays) > 1 and set(arrays) <= set("abcdefg")
 
 
 def _of_mapping(tree: Mapping[str, Any], name: str) -> Iterator[Table]:
@@ -104,7 +112,9 @@ def _of_mapping(tree: Mapping[str, Any], name: str) -> Iterator[Table]:
     if numbered := _numbered(own):
         for k, arrays in numbered.items():
             yield from _several(arrays, f"{name} {k}")
-    elif any(value.ndim for value in own.values()) and _tells(arrays := _all_upright(flat(tree))):
+    elif (
+        not _lettered(own) and any(value.ndim for value in own.values()) and _tells(arrays := _all_upright(flat(tree)))
+    ):
         yield from _several(arrays, name)
     else:
         parts = {key: value for key, value in tree.items() if key not in own or (own[key].ndim > 1 and is_place(key))}

@@ -278,7 +278,7 @@ def demonstrations_of(
     for note, paths in said.items():
         logger.warning("%s%s: %s", paths[0], f" and {len(paths) - 1} more" * (len(paths) > 1), note)
     with parsing(DemonstrationError, source, "takes", "recorded motions"):
-        takes, note = in_si_units([take for _, some, _ in found for take in some])
+        takes, note = in_si_units([take for _, some, _ in found for take in some], _num_joints(arm))
         if note:
             logger.warning("%s: %s", source, note)
         check_at_most("demonstrations", len(takes), MAX_DEMONSTRATIONS)

@@ -172,10 +172,10 @@ def _common_goal(takes: Sequence[Repaired], spread: float, settings: Preparation
             goal = ends[np.linalg.norm(ends - goal, axis=1).argmin()]
     for take, end in zip(takes, ends, strict=True):
         off = float(np.linalg.norm(end - goal))
-        text = f"ends {in_millimetres(off)} from the {'goal' if settings.goal else 'common goal'}"
+        text = f"ends {in_millimetres(off)} from the {'common goal' if settings.goal is None else 'goal'}"
         if off > reach and settings.leave_out:
             take.leave_out("elsewhere", text)
-        elif 0 < off <= take.jitter:
+        elif 0 < off <= take.jitter and settings.move_ends:
             take.positions = _end_moved(take.positions, goal)
         elif off <= settings.same_goal * spread:
             continue

@@ -18,6 +18,7 @@ from dt_viz.flows.fields import Array
 from dt_viz.learning.demonstrations import (
     DIMENSIONS,
     MAX_COORDINATE,
+    MAX_DURATION,
     Demonstration,
     DemonstrationError,
     load_demonstrations,
@@ -31,7 +32,7 @@ Demonstrations: TypeAlias = (
 )
 """What `fit` learns from; see there."""
 DURATION = 5.0
-"""Duration of a take without times, seconds."""
+"""Duration of a take without times, seconds, as in files."""
 UNTIMED = np.empty(0)
 """Times of a take without times, until it is known whether all have some."""
 ACCEPTED = "arrays (T, 2) or (T, 3), metres, such as dt.fit([positions, …], rate=100)"
@@ -75,6 +76,10 @@ def demonstrations_of(given: Any, rate: float | None = None) -> tuple[Demonstrat
             found = f"{farthest.max():.6g} m in {checked[int(farthest.argmax())].name!r}"
             accepted = f"metres, at most {MAX_COORDINATE:g} from the origin; of millimetres: positions / 1000"
             raise FormatError("positions", found, accepted)
+        longest = max(checked, key=lambda take: take.duration)
+        if longest.duration > MAX_DURATION:
+            found = f"a duration of {longest.duration:.6g} s in {longest.name!r}; is it in milliseconds?"
+            raise FormatError("times", found, f"seconds, at most {MAX_DURATION:g} from first to last")
     return checked
 
 

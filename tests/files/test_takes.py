@@ -646,3 +646,68 @@ def test_mutated_files_are_read_or_refused(files, suffix):
         else:
             for demonstration in read:
                 assert np.isfinite(demonstration.positions).all() and (np.diff(demonstration.times) > 0).all()
+
+
+class Panda:
+    """Seven joints, whose hand is where the first three angles say."""
+
+    joint_names = tuple(f"joint{k}" for k in range(1, 8))
+
+    def end_effector(self, q):
+        return np.asarray(q)[..., :3]
+
+
+def test_a_gripper_beside_joint_angles_says_nothing_of_their_unit(tmp_path):
+    q = np.column_stack([np.resize(path_of(), (60, 3)), np.zeros((60, 4)), np.linspace(0, 255, 60)])
+    np.savez(tmp_path / "arm.npz", qpos=q, time=TIMES)
+    (take,) = load_demonstrations(tmp_path / "arm.npz", arm=Panda())
+    np.testing.assert_allclose(take.positions, q[:, :3])
+
+
+@pytest.mark.parametrize(
+    ("content", "name", "words"),
+    [
+        (
+            json.dumps([path_of().tolist(), [*path_of().tolist()[:-1], [1.0]]]).encode(),
+            "a.json",
+            "take 2: found no places",
+        ),
+        (
+            table(("t", "x_mm", "y_mm", "z_cm"), [TIMES, path_of()]),
+            "a.csv",
+            "several units of one length",
+        ),
+        (b"t,x,y,z\n0,0.1,0.2,\n1,0.2,0.3,0.4\n2,0.3,0.4,0.5\n", "a.csv", "line 2"),
+    ],
+    ids=["a short row", "two units", "an empty cell"],
+)
+def test_nothing_is_left_out_without_a_word(content, name, words):
+    assert words in refusal(content, name)
+
+
+@pytest.mark.parametrize(("unit", "value", "seconds"), [("", 0.01, 0.01), ("_ms", 10.0, 0.01), (" [ms]", 20.0, 0.02)])
+def test_a_column_of_intervals_has_a_unit(unit, value, seconds):
+    content = table((f"dt{unit}", "x", "y", "z"), [np.full(60, value), path_of()])
+    (take,) = read_demonstrations(content, "a.csv")
+    assert take.duration == pytest.approx(59 * seconds)
+
+
+def test_lists_of_different_lengths_are_refused(tmp_path):
+    pa, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    places = [*path_of()[:, :2].tolist(), [0.1, 0.2], [0.1, 0.2, 0.3, 0.4]]
+    parquet.write_table(pa.table({"observation.state": places}), tmp_path / "a.parquet")
+    with pytest.raises(DemonstrationError, match="lists of different lengths"):
+        load_demonstrations(tmp_path / "a.parquet", rate=20)
+
+
+def test_takes_may_have_letters_for_names(tmp_path):
+    np.savez(tmp_path / "k.npz", a=path_of(0), b=path_of(1))
+    takes = load_demonstrations(tmp_path / "k.npz", rate=20)
+    for take, path in zip(takes, (path_of(0), path_of(1)), strict=True):
+        np.testing.assert_allclose(take.positions, path)
+
+
+def test_half_a_take_of_our_own_is_refused(tmp_path):
+    np.savez(tmp_path / "k.npz", times_0=TIMES, positions_0=path_of(), times_1=TIMES)
+    with pytest.raises(DemonstrationError, match="only one of times_1 and positions_1"):
+        load_demonstrations(tmp_path / "k.npz")
