@@ -163,3 +163,8 @@ def told(warnings: Iterable[MotionWarning]) -> tuple[MotionWarning, ...]:
 def in_millimetres(length: float) -> str:
     """Format a length, metres."""
     return f"{1e3 * length:.0f} mm" if length >= 0.01 else f"{1e3 * length:.2g} mm"
+
+
+def in_metres(point: Iterable[float]) -> str:
+    """Format a place, metres, such as "(0.1, -0.53, 0.15) m"."""
+    return f"({', '.join(f'{round(float(x), 6) + 0.0:.3g}' for x in point)}) m"

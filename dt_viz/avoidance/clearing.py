@@ -15,6 +15,9 @@ MAX_STEPS, SHORTEST = 100, 1e-4
 """Largest number of steps along a line, and the smallest one, metres: bounds the overshoot beyond the surface."""
 
 
+ANY = 1e-4
+"""Lack beyond which its size does not matter, where it is only asked whether points are clear."""
+
 Lack = Callable[[Array, float], Array]
 """What points (N, d) lack to be clear, (N,), at most 0 where they are; beyond the given lack, only that."""
 
@@ -36,7 +39,7 @@ def clearing_duration(field: VectorField, points: Array, lack: Lack, step: float
         The duration, or None where some point is not clear after the longest.
     """
     duration, before = 0.0, points
-    while (lacking := lack(points, SHORTEST) > 0).any():
+    while (lacking := lack(points, ANY) > 0).any():
         if duration >= longest:
             return None
         before = points[lacking]

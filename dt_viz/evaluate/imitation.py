@@ -157,11 +157,9 @@ def _report_held_out(rows: Sequence[dict[str, Any]]) -> None:
     """Print the rows of `summed_up`, and how often and how far what was learned is nearer than what takes none."""
     print("\nheld out: each demonstration against what was learned from the others")
     report(_with_means(rows))
-    better, of_mean = (
-        (row["learned_mm"] < min(row["mean_mm"], row["nearest_mm"]) for row in rows),
-        [row["of_mean"] for row in rows],
-    )
-    print(f"nearer than both without learning: {sum(better)} of {len(rows)}")
+    better = sum(row["learned_mm"] < min(row["mean_mm"], row["nearest_mm"]) for row in rows)
+    of_mean = [row["of_mean"] for row in rows]
+    print(f"nearer than both without learning: {better} of {len(rows)}")
     print(f"relative to the mean, shifted: {geometric_mean(of_mean):.3f} (geometric mean), {max(of_mean):.3f} at worst")
 
 

@@ -14,7 +14,7 @@ from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.demonstrations import Demonstration, samples_of
 from dt_viz.learning.inspection import Inspection, PreparationSettings, Repaired, repair
 from dt_viz.metrics import arc_length, discrete_frechet, resample_by_arc_length
-from dt_viz.warning import in_millimetres
+from dt_viz.warning import in_metres, in_millimetres
 
 DECIDING = 1e-3  # deviation that points are given along a way, in spreads, to decide between axes that are alike
 
@@ -194,9 +194,9 @@ def _given_goal(given: Sequence[float], ends: Array, reach: float) -> Array:
         raise ImitationError(f"goal: found {given}; accepted: {ends.shape[1]} finite numbers, metres")
     off = np.linalg.norm(ends - goal, axis=1)
     if off.min() > reach:
-        nearest = _place(ends[off.argmin()])
+        nearest = in_metres(ends[off.argmin()])
         raise ImitationError(
-            f"goal: found {_place(goal)}, at which no demonstration ends; accepted: a place within "
+            f"goal: found {in_metres(goal)}, at which no demonstration ends; accepted: a place within "
             f"{in_millimetres(reach)} of an end, such as {nearest}"
         )
     return goal
@@ -211,16 +211,12 @@ def _no_common_goal(takes: Sequence[Repaired], ends: Array, reach: float) -> str
         left[group] = False
         names = ", ".join(f"'{takes[k].demonstration.name}'" for k in group[:3])
         more = f" and {len(group) - 3} more" if len(group) > 3 else ""
-        groups.append(f"{names}{more} at {_place(ends[group].mean(axis=0))}")
+        groups.append(f"{names}{more} at {in_metres(ends[group].mean(axis=0))}")
     several = f" and {len(groups) - 4} more places" if len(groups) > 4 else ""
     return (
         f"the demonstrations have no common goal, they end at {'; '.join(groups[:4])}{several}. "
         f"Choose one of these places as the goal (goal=…), or learn the takes of each place by themselves"
     )
-
-
-def _place(point: Array) -> str:
-    return f"({', '.join(f'{x:.3g}' for x in point)}) m"
 
 
 def _lead_to_goal(take: Repaired, goal: Array, near: float) -> None:

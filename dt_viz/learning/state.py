@@ -111,7 +111,8 @@ def leaving_out(
 ) -> StateChoice:
     """Follow motions by what the others teach in both states, in a few folds or until the plain one is clearly worse.
 
-    Motions of all lengths are in each fold, in whichever order they come.
+    Motions of all lengths are in each fold, in whichever order they come. Goal and size are those of all motions, in
+    both states and for the mean alike.
 
     Args:
         motions: at least two.

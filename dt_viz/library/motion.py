@@ -32,7 +32,7 @@ from dt_viz.learning.patterns import AugmentedSettings
 from dt_viz.learning.preparation import DemonstrationWarning, prepare
 from dt_viz.learning.state import State, learn
 from dt_viz.library.places import as_place, in_space
-from dt_viz.library.report import many, missed, placed, sampled, summaries
+from dt_viz.library.report import many, missed, sampled, summaries
 from dt_viz.library.takes import Demonstrations, demonstrations_of
 from dt_viz.motion.certificates import Certificates, DrawnSamples, certified
 from dt_viz.motion.diagnostics import motion_warnings
@@ -42,6 +42,7 @@ from dt_viz.motion.stack import FINE, Solution, build_stack
 from dt_viz.saving import SavedMotion, load_motion, save_motion
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.tasks import Task
+from dt_viz.warning import in_metres
 
 NUM_COORDINATES = 3
 """Coordinates of motions in space."""
@@ -74,12 +75,10 @@ class Motion:
         """d: 2 of drawings, 3 of motions in space."""
 
     def __repr__(self) -> str:
-        takes, where = (
-            many(len(self._learned.imitation.starts), "take"),
-            "the plane" if self.dimension == 2 else "space",
-        )
+        takes = many(len(self._learned.imitation.starts), "take")
+        where = "the plane" if self.dimension == 2 else "space"
         layers = "".join(f", {layer.name}" for layer in self._layers)
-        goal = placed(self._learned.goal[: self.dimension])
+        goal = in_metres(self._learned.goal[: self.dimension])
         return f"Motion({takes} in {where}, {self.state} state, goal {goal}{layers})"
 
     def report(self) -> str:

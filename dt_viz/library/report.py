@@ -3,19 +3,12 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
-
-import numpy as np
+from collections.abc import Sequence
 
 from dt_viz.flows.fields import Array
 from dt_viz.learning.inspection import Inspection
 from dt_viz.metrics import arc_length, discrete_frechet, resample_by_arc_length
 from dt_viz.warning import in_millimetres
-
-
-def placed(point: Iterable[float]) -> str:
-    """A place, such as "(0.1, -0.53, 0.15) m"."""
-    return f"({', '.join(f'{x + 0.0:.3g}' for x in np.round(list(point), 6))}) m"
 
 
 def many(num: int, what: str) -> str:
