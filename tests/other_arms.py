@@ -68,6 +68,16 @@ def seven_joints() -> Robot:
     )
 
 
+def shorter(robot, part):
+    """The JACO with all lengths shorter by a factor, as another arm."""
+    lengths = {name: part * getattr(robot, name) for name in ("joint_translations", "end_effector_offset", "levers")}
+    meshes = tuple(replace(mesh, vertices=part * mesh.vertices) for mesh in robot.meshes)
+    spheres = robot.body.spheres.copy()
+    for name in ("offset", "radius"):
+        spheres[name] *= part
+    return replace(robot, name="other", meshes=meshes, body=replace(robot.body, spheres=spheres), **lengths)
+
+
 PER_JOINT = (
     "joint_names",
     "lower",

@@ -8,10 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin  # noqa: TID251, here it is the oracle
 import pytest
-from other_arms import MORE, OTHER_ARMS, five_joints, seven_joints
+from other_arms import MORE, OTHER_ARMS, five_joints, seven_joints, shorter
 from pinocchio_arm import random_configurations
 from scenes import avoiding
 
+import dt_viz as dt
 from dt_viz.control.controller import ArmController, Phase
 from dt_viz.memo import Memo
 from dt_viz.motion.stack import FINE
@@ -131,3 +132,19 @@ def test_engines_of_two_arms_share_what_is_kept_and_none_gets_what_is_the_others
             assert solved.arm is not None
             assert known.references.shape[1] == solved.arm.p.shape[1] == arm.num_joints
             np.testing.assert_array_equal(solved.arm.p, found.setdefault(arm.name, solved.arm.p))
+
+
+def around_a_ball(arm: Robot, size: float) -> tuple[dt.JointPath, ...]:
+    """The whole arm pushes the box around a ball, all lengths of the task scaled."""
+    takes = tuple(replace(take, positions=size * take.positions) for take in dt.example("push_box")[:3])
+    ball = dt.Sphere(as_point(size * TASKS["push_box"]().mean_path[55]), diameter=0.12 * size)
+    around = dt.fit(takes, state="plain").stack(dt.ArmAvoidance(ball, margin=0.01 * size))
+    return dt.Arm(arm).rollouts(around, spacing=0.005 * size)
+
+
+def test_an_arm_of_half_the_size_moves_as_the_whole_one(robot):
+    """All lengths in settings scale with the arm: in a world of half the size its joints do the same."""
+    for whole, half in zip(around_a_ball(robot, 1.0), around_a_ball(shorter(robot, 0.5), 0.5), strict=True):
+        np.testing.assert_allclose(half.q, whole.q, atol=1e-8)
+        np.testing.assert_allclose(half.error, whole.error / 2, atol=1e-9)
+        assert whole.error.max() > 0.02  # the hand gives way

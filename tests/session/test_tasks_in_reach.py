@@ -4,21 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from other_arms import shorter
 
 from dt_viz.robot.placement import follows, is_jaco
 from dt_viz.scenario.paper_scenes import offered
 from dt_viz.scenario.tasks import TASKS, Task, TaskEntry
 from dt_viz.session.tasks_in_reach import in_reach
-
-
-def shorter(robot, part):
-    """The JACO with all lengths shorter by a factor, as another arm."""
-    lengths = {name: part * getattr(robot, name) for name in ("joint_translations", "end_effector_offset", "levers")}
-    meshes = tuple(replace(mesh, vertices=part * mesh.vertices) for mesh in robot.meshes)
-    spheres = robot.body.spheres.copy()
-    for name in ("offset", "radius"):
-        spheres[name] *= part
-    return replace(robot, name="other", meshes=meshes, body=replace(robot.body, spheres=spheres), **lengths)
 
 
 def test_tasks_of_the_jaco_stay_as_they_are(robot):
