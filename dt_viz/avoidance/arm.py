@@ -193,10 +193,11 @@ class WholeArm:
         tangents = np.gradient(self.robot.end_effector(q), axis=1).reshape(-1, 3)
         tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
         q = q.reshape(-1, q.shape[-1])
-        near: Mask = np.array([self.clearance(q, part, margin, margin - ROUNDING) < margin for part in parts])
-        near = near.reshape(len(parts), len(q))
-        clearance = np.array([self.body.outermost.clearance(self.robot, q, part, beside) for part in parts])  # about
+        clearance = np.array([self.body.outermost.clearance(self.robot, q, part, beside) for part in parts])  # at most
         clearance = clearance.reshape(len(parts), len(q))
+        near: Mask = clearance < margin
+        for part, mask in zip(parts, near, strict=True):
+            mask[mask] = self.clearance(q[mask], part, margin, margin - ROUNDING) < margin
 
         def escapes(which: Indices) -> list[Array]:
             """Directions that leave all of these obstacles."""

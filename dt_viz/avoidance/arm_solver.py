@@ -230,12 +230,12 @@ class Solver:
         """Clearances (N,), metres, that are asked for at configurations (N, n), and that are kept.
 
         Asked for is the margin, or what the starts and goal beside a configuration have. What is kept is cut off where
-        it is more by what a contact moves between two checks, or less by `most`.
+        it is more or less by `most`, or more by what a contact moves between two checks.
         """
         pins, levers = self._lifted.pins, np.array(self._robot.levers)
         asked = room_asked(np.array(p, order="C"), pins, self._room, levers, SLOPE, self._margin)
-        highest = asked + self._settings.speed * SNAPSHOT
-        return asked, self._body.clearance(self._robot, p, self._avoidance.avoided, highest, asked - most)
+        more = min(self._settings.speed * SNAPSHOT, most)
+        return asked, self._body.clearance(self._robot, p, self._avoidance.avoided, asked + more, asked - most)
 
     def _clearing_duration(self, p: Array) -> float:
         """The shortest duration after which the flow has carried configurations (N, n) clear, or the longest."""

@@ -101,7 +101,7 @@ class BodyPoints:
         They are too small by `PROTRUSION` at most, and cut off at `lowest` and `highest`, each (N,) or one for all.
         """
         shapes, values = records(obstacle.parts if isinstance(obstacle, Union) else (obstacle,))
-        low, high = (np.array(np.broadcast_to(bound, len(q)), dtype=float) for bound in (lowest, highest))
+        low, high = np.full(len(q), lowest, dtype=float), np.full(len(q), highest, dtype=float)
         return clearance(robot.records, self.spheres, shapes, values, np.array(q, order="C"), low, high)
 
     @cached_property

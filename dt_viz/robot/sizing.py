@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import field, fields, replace
+from functools import lru_cache
 from typing import Any, TypeVar
 
 _Settings = TypeVar("_Settings")
@@ -13,6 +14,7 @@ def scales(default: float, power: float = 1) -> Any:  # noqa: ANN401 - as `datac
     return field(default=default, metadata={"metres": power})
 
 
+@lru_cache(maxsize=64)
 def sized(settings: _Settings, size: float) -> _Settings:
     """Settings, a frozen dataclass, for an arm whose reach is `size` times the JACO's."""
     powers: dict[str, float] = {own.name: own.metadata.get("metres", 0) for own in fields(settings)}  # pyright: ignore
