@@ -115,7 +115,7 @@ def test_the_examples_are_the_shipped_tasks():
         (np.zeros(3), r"shape \(3,\); accepted: arrays \(T, 2\) or \(T, 3\), metres"),
         ((0.1, 0.2, 0.3), r"shape \(3,\)"),
         (PATH.T, r"shape \(2, 101\).*positions\.T"),
-        (np.zeros((50, 6)), r"shape \(50, 6\).*joint angles: positions = arm\.robot\.end_effector\(q\)"),
+        (np.zeros((50, 6)), r"shape \(50, 6\).*joint angles: positions = arm\.end_effector\(q\)"),
         (np.zeros((3, 50, 7)), "joint angles.*poses"),
         (np.zeros((50, 4)), "the first column is time"),
         (PATH * np.nan, "found nan at sample 1; accepted: finite numbers"),

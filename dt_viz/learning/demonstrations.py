@@ -8,11 +8,12 @@ import io
 import logging
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from dt_viz.errors import DataError, FormatError, naming, parsing
 from dt_viz.files.checks import check_at_most, check_finite, real_numbers
@@ -220,7 +221,7 @@ def load_demonstrations(
             such as ``{"x": "column", "y": "other"}``; None finds them.
         topic: topic of a bag, or frame of its transforms; None takes the only one with poses.
         arm: what turns joint angles into places of the hand: an arm, or anything with `joint_names` and
-            `end_effector`.
+            `end_effector`. Places in space are taken as in the frame of its base.
 
     Raises:
         DemonstrationError: there is no such file or folder, it cannot be read, is not what its suffix says, needs a
@@ -279,6 +280,7 @@ def demonstrations_of(
         logger.warning("%s%s: %s", paths[0], f" and {len(paths) - 1} more" * (len(paths) > 1), note)
     with parsing(DemonstrationError, source, "takes", "recorded motions"):
         takes, note = in_si_units([take for _, some, _ in found for take in some], _num_joints(arm))
+        takes = [_turned(take, arm) for take in takes]
         if note:
             logger.warning("%s: %s", source, note)
         check_at_most("demonstrations", len(takes), MAX_DEMONSTRATIONS)
@@ -326,12 +328,19 @@ def _read(file: BinaryIO, source: Path, options: ReadOptions) -> Found:
 
 
 def _num_joints(arm: ForwardKinematics | None) -> int | None:
-    return None if arm is None else len(_kinematics(arm).joint_names)
+    return None if arm is None else len(arm.joint_names)
 
 
-def _kinematics(arm: ForwardKinematics) -> ForwardKinematics:
-    """The arm itself, or the robot of a `dt.Arm`."""
-    return getattr(arm, "robot", arm)
+def _turned(take: Take, arm: ForwardKinematics | None) -> Take:
+    """Turn what was recorded in the frame of an arm's base to the frame that the arm is used in."""
+    base: np.ndarray = np.eye(3) if arm is None else getattr(arm, "base", np.eye(3))
+    if take.positions is None or take.positions.shape[1] != len(base) or np.array_equal(base, np.eye(3)):
+        return take
+    wxyz = take.orientations
+    if wxyz is not None:
+        turned = Rotation.from_matrix(base) * Rotation.from_quat(np.roll(wxyz, -1, axis=1))
+        wxyz = np.roll(turned.as_quat(), 1, axis=1)
+    return replace(take, positions=take.positions @ base.T, orientations=wxyz)
 
 
 def _hand(take: Take, arm: ForwardKinematics | None) -> np.ndarray:
@@ -343,15 +352,14 @@ def _hand(take: Take, arm: ForwardKinematics | None) -> np.ndarray:
     if arm is None:
         accepted = "places of the hand, x, y and perhaps z; or name the arm that turns angles into such: arm=…"
         raise FormatError(f"columns of {take.name!r}", found, accepted)
-    robot = _kinematics(arm)
-    wanted = list(robot.joint_names)
+    wanted = list(arm.joint_names)
     check_finite(q, f"joints of {take.name!r}", take.place)
     if set(wanted) <= set(names):
-        return robot.end_effector(q[:, [names.index(name) for name in wanted]])
+        return arm.end_effector(q[:, [names.index(name) for name in wanted]])
     if len(names) not in (len(wanted), len(wanted) + 1):  # the last one may be a gripper
         accepted = f"those of the arm's {len(wanted)} ({', '.join(wanted)[:160]}), and perhaps a gripper's behind them"
         raise FormatError(f"columns of {take.name!r}", found, accepted)
-    return robot.end_effector(q[:, : len(wanted)].copy())
+    return arm.end_effector(q[:, : len(wanted)].copy())
 
 
 def save_demonstrations(path: str | Path, demonstrations: Sequence[Demonstration]) -> None:

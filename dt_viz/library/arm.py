@@ -6,8 +6,10 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from dt_viz.control.controller import ArmController
 from dt_viz.control.settings import ControllerSettings
@@ -26,6 +28,8 @@ from dt_viz.robot.retiming import within_velocity_limits
 from dt_viz.robot.robot import Robot
 from dt_viz.robot.tracking_settings import TrackingSettings
 from dt_viz.warning import in_millimetres
+
+Frame = Literal["base", "page"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,9 +56,21 @@ class BlockedError(Exception):
 class Arm:
     """A robot arm of three to eight revolute joints."""
 
-    def __init__(self, robot: Robot) -> None:
-        """Wrap a robot; see `load_arm` and `from_urdf`."""
-        self.robot = robot
+    def __init__(self, robot: Robot, frame: Frame = "base") -> None:
+        """Wrap a robot; see `load_arm` and `from_urdf`.
+
+        Args:
+            robot: the arm with its front at −y.
+            frame: that of all places of this arm: "base", its URDF's, or "page", that of the page, in which the front
+                is −y; for the JACO they are one.
+
+        Raises:
+            ValueError: there is no such frame.
+        """
+        if frame not in get_args(Frame):
+            raise ValueError(f"frame: found {frame!r}; accepted: {', '.join(get_args(Frame))}")
+        self._on_page = robot
+        self.robot = robot.in_base_frame() if frame == "base" else robot
         self._follower = Follower(robot)
 
     @classmethod
@@ -67,6 +83,7 @@ class Arm:
         srdf: str | os.PathLike[str] | None = None,
         package_dirs: Sequence[str | os.PathLike[str]] = (),
         locked: Sequence[str] | Mapping[str, float] | None = None,
+        frame: Frame = "base",
     ) -> Arm:
         """Load an arm from a URDF; what is not given is found, and `report` says why. It takes seconds the first time.
 
@@ -78,23 +95,38 @@ class Arm:
             srdf: file that names the end effector, states, and pairs of links that may touch.
             package_dirs: folders in which the `package://` addresses of meshes resolve.
             locked: joints that do not move, perhaps each with its value, rad or metres; None locks grippers.
+            frame: see `Arm`.
 
         Raises:
             DataError: the URDF, a mesh, or what is given cannot be used.
         """
         folders = [Path(folder) for folder in package_dirs]
         semantic = None if srdf is None else Path(srdf)
-        return cls(robot_from_urdf(Path(path), end_effector, home, front, semantic, folders, locked))
+        return cls(robot_from_urdf(Path(path), end_effector, home, front, semantic, folders, locked), frame)
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the n joints, from the base to the hand."""
+        return self.robot.joint_names
+
+    @property
+    def base(self) -> Array:
+        """(3, 3) rotation from the frame of the URDF's base to that of this arm's places."""
+        return self.robot.base
+
+    def end_effector(self, q: ArrayLike) -> Array:
+        """Compute the positions (*B, 3) of the hand, metres, at joint angles q (*B, n), rad."""
+        return self.robot.end_effector(q)
 
     def report(self) -> str:
         """Say what was chosen of the arm and why, a line for each: joints, tool, front, ready pose, body, limits."""
         return self.robot.report()
 
     def place(self, demonstrations: Sequence[Demonstration], scale: float | None = None) -> tuple[Demonstration, ...]:
-        """Move and scale demonstrations in space, made for an arm of the JACO's size, into reach.
+        """Move, scale and turn demonstrations in space, made for an arm of the JACO's size, into reach.
 
         Args:
-            demonstrations: with three coordinates, the arm's front at −y.
+            demonstrations: with three coordinates, the arm's front at −y as in `dt_viz.example`.
             scale: the scale that is wanted; None takes the largest that fits, up to the arm's reach by the JACO's.
 
         Raises:
@@ -103,8 +135,9 @@ class Arm:
         """
         if demonstrations and demonstrations[0].dimension != NUM_COORDINATES:
             raise ValueError(f"the arm follows motions in space, with 3 coordinates, not {demonstrations[0].dimension}")
-        placed = place(self.robot, [demonstration.positions for demonstration in demonstrations], scale)
-        return tuple(replace(one, positions=placed(one.positions)) for one in demonstrations)
+        placed = place(self._on_page, [demonstration.positions for demonstration in demonstrations], scale)
+        turn = self._on_page.base @ self.robot.base.T
+        return tuple(replace(one, positions=placed(one.positions) @ turn) for one in demonstrations)
 
     def __repr__(self) -> str:
         return f"Arm({self.robot.title}: {self.robot.num_joints} joints, reach {self.robot.reach:.2f} m)"
@@ -220,19 +253,20 @@ def _live(motion: Motion) -> Solved:
     return Solved(scenario, nominal, nominal, build_stack(nominal, scenario.active, LIVE))
 
 
-def load_arm(name: str = "jaco", tracking: TrackingSettings | None = None) -> Arm:
+def load_arm(name: str = "jaco", tracking: TrackingSettings | None = None, frame: Frame = "base") -> Arm:
     """Load an arm by its name.
 
     Args:
         name: jaco, panda, ur3, ur5, ur10, xarm7, z1, so100 or so101; or a name of the package robot_descriptions, such
             as "gen3", where that is installed and has downloaded it.
         tracking: settings of its inverse kinematics; None are the defaults.
+        frame: see `Arm`.
 
     Raises:
         DataError: there is no such arm; the message lists those that there are.
     """
     robot = load_robot(name)
-    return Arm(robot if tracking is None else replace(robot, tracking=tracking))
+    return Arm(robot if tracking is None else replace(robot, tracking=tracking), frame)
 
 
 def load_jaco(tracking: TrackingSettings | None = None) -> Arm:

@@ -69,13 +69,15 @@ def inverse_kinematics(
         UnreachableError: No start arrived. The message says by how much the best one missed.
     """
     settings, target = robot.sized_tracking, np.asarray(target, dtype=float)
-    azimuth = np.arctan2(target[0], -target[1])  # 0 ahead of the base
+    ahead, left = np.array(robot.front), np.array([-robot.front[1], robot.front[0], 0.0])
+    azimuth = np.arctan2(left @ target, ahead @ target)  # 0 ahead of the base
     ready = robot.home.copy()
     ready[0] += np.round(robot.joint_rotations[0, 2, 2]) * azimuth  # whichever way the first joint's axis points
     ready = robot.clip(ready)
     if seed is None:
         reference = ready
-        direction = np.array([np.sin(azimuth), -np.cos(azimuth), -np.tan(settings.hand_pitch)])
+        direction = np.sin(azimuth) * left + np.cos(azimuth) * ahead
+        direction[2] = -np.tan(settings.hand_pitch)
     else:
         reference = np.asarray(seed, dtype=float)
         direction = robot.hand_direction(reference)

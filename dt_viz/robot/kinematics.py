@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dt_viz.kernels.arm import JOINT, chains, places
+from dt_viz.robot.meshes import constant
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from dt_viz.flows.fields import Array
 
+T = TypeVar("T", bound="Kinematics")
 REFERENCE_REACH = 0.9851132221222917
 """Reach of the JACO, metres, for which lengths that belong to an arm's size are given."""
 WORKING_RADIUS = 0.95
@@ -99,6 +101,12 @@ class Kinematics:
         joints = np.zeros(self.num_joints, JOINT)
         joints["rotation"], joints["translation"] = self.joint_rotations, self.joint_translations
         return joints
+
+    def turned(self: T, base: Array) -> T:
+        """The same on a base that is turned by a rotation (3, 3)."""
+        rotations, translations = np.array(self.joint_rotations), np.array(self.joint_translations)
+        rotations[0], translations[0] = base @ rotations[0], base @ translations[0]
+        return replace(self, joint_rotations=constant(rotations), joint_translations=constant(translations))
 
     def forward_kinematics(self, q: ArrayLike) -> tuple[Array, Array]:
         """Compute the poses of the joint frames (each turns with the link after it).

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -11,6 +11,8 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, DTypeLike, NDArray
 
     from dt_viz.flows.fields import Array
+
+T = TypeVar("T", bound="LinkMesh")
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +27,10 @@ class LinkMesh:
     """(V, 3) metres, in the frame of that joint; of the base in the base frame."""
     faces: NDArray[np.intp]
     """(F, 3) indices of vertices."""
+
+    def turned(self: T, base: Array) -> T:
+        """The same on a base that is turned by a rotation (3, 3): what is fixed to the base turns along."""
+        return self if self.joint >= 0 else replace(self, vertices=constant(self.vertices @ base.T))
 
 
 @dataclass(frozen=True, eq=False)

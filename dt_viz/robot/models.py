@@ -380,12 +380,5 @@ def _turned(shapes: Shapes, base: Array) -> Shapes:
     """Turn the base of an arm."""
     if np.array_equal(base, np.eye(3)):
         return shapes
-    arm = shapes.kinematics
-    rotations, translations = arm.joint_rotations.copy(), arm.joint_translations.copy()
-    rotations[0], translations[0] = base @ rotations[0], base @ translations[0]
-
-    def placed(mesh: Any) -> Any:  # noqa: ANN401 - of either kind
-        return mesh if mesh.joint >= 0 else replace(mesh, vertices=constant(mesh.vertices @ base.T))
-
-    turned = replace(arm, joint_rotations=constant(rotations), joint_translations=constant(translations))
-    return Shapes(turned, tuple(map(placed, shapes.meshes)), tuple(map(placed, shapes.visuals)))
+    meshes, visuals = (mesh.turned(base) for mesh in shapes.meshes), (mesh.turned(base) for mesh in shapes.visuals)
+    return Shapes(shapes.kinematics.turned(base), tuple(meshes), tuple(visuals))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,7 +16,7 @@ from dt_viz.robot.body_points import BodyPoints
 from dt_viz.robot.collision import CollisionModel
 from dt_viz.robot.kinematics import Kinematics
 from dt_viz.robot.link_distances import page_names
-from dt_viz.robot.meshes import LinkMesh, VisualMesh
+from dt_viz.robot.meshes import LinkMesh, VisualMesh, constant
 from dt_viz.robot.sizing import sized
 from dt_viz.robot.tracking_settings import TrackingSettings
 
@@ -33,7 +33,7 @@ LEAST_JOINTS = 3
 class Robot(Kinematics):
     """An arm of n joints, all that is known of it.
 
-    Its frame is that of the arm's base, turned about z so that the arm's front is −y.
+    Its frame is that of the arm's base, turned about z so that the arm's front is −y; see `in_base_frame`.
     """
 
     name: str
@@ -73,12 +73,30 @@ class Robot(Kinematics):
     """Settings of inverse kinematics and tracking, their lengths for an arm as large as the JACO."""
     found: tuple[tuple[str, str], ...] = ()
     """What was chosen of it, and why."""
+    front: tuple[float, float, float] = (0.0, -1.0, 0.0)
+    """Horizontal unit vector to where it works."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for fewer joints than the hand has coordinates, or more than compiled loops take."""
         if not LEAST_JOINTS <= self.num_joints <= MOST_JOINTS:
             accepted = f"{LEAST_JOINTS} to {MOST_JOINTS} between base and hand"
             raise ValueError(f"{self.name}: found {self.num_joints} joints; accepted: {accepted}")
+
+    def in_base_frame(self) -> Robot:
+        """The same arm in the frame of its URDF's base, whatever its front is."""
+        if np.array_equal(self.base, np.eye(3)):
+            return self
+        back, spheres = self.base.T, self.body.spheres.copy()
+        fixed = spheres["joint"] < 0
+        spheres["offset"][fixed] = spheres["offset"][fixed] @ back.T
+        return replace(
+            self.turned(back),
+            body=BodyPoints(spheres),
+            meshes=tuple(mesh.turned(back) for mesh in self.meshes),
+            visuals=tuple(mesh.turned(back) for mesh in self.visuals),
+            base=constant(np.eye(3)),
+            front=tuple((back @ self.front).tolist()),
+        )
 
     def report(self) -> str:
         """Say what was chosen of the arm, and why, a line for each."""

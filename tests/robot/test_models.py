@@ -6,14 +6,17 @@
 import sys
 from pathlib import Path
 from types import ModuleType
+from typing import Literal
 
 import coal  # noqa: TID251, here it is the oracle
 import numpy as np
+import pinocchio as pin  # noqa: TID251, here it is the oracle
 import pytest
 import trimesh
 from arm_files import link, random_postures, urdf, write
 from scipy.spatial import KDTree
 
+import dt_viz as dt
 from dt_viz.folders import default_cache_folder
 from dt_viz.robot import models
 from dt_viz.robot.arm_cache import from_arrays, to_arrays
@@ -381,3 +384,86 @@ def test_a_material_that_has_changed_is_read_again(tmp_path):
         material.write_text(f"newmtl paint\nKd {paint}\n")
         found.append([each.colour for each in robot_from_urdf(path).visuals if each.name == "box.obj"])
     assert found == [[(255, 0, 0)], [(0, 255, 0)]]
+
+
+def near_home(arm, num, seed):
+    near = arm.robot.home + 0.2 * np.random.default_rng(seed).normal(size=(num, arm.robot.num_joints))
+    return arm.robot.clip(near)
+
+
+@each_arm
+def test_joints_are_where_pinocchio_has_them_in_the_frame_of_the_base(name):
+    arm = dt.load_arm(name)
+    model = pin.buildModelFromUrdf(str(arm.robot.urdf))
+    data, number = model.createData(), [model.getJointId(joint) for joint in arm.robot.joint_names]
+    for q in near_home(arm, 5, seed=1):
+        angles = pin.neutral(model)
+        angles[[model.joints[k].idx_q for k in number]] = q
+        pin.forwardKinematics(model, data, angles)
+        _, origins = arm.robot.forward_kinematics(q)
+        np.testing.assert_allclose(origins, [data.oMi[k].translation for k in number], atol=1e-12)
+
+
+@each_arm
+def test_what_is_fixed_to_the_base_is_turned_along(name):
+    """Distances from an obstacle, the same in both frames, by the body points and by the true shapes."""
+    arm, page = dt.load_arm(name), dt.load_arm(name, frame="page")
+    q, (x, y, z) = near_home(arm, 20, seed=2), 0.3 * arm.robot.reach * np.array([0.6, 0.3, 0.5])
+    ball, turned = dt.Sphere((x, y, z)), dt.Sphere(tuple(page.robot.base @ (x, y, z)))
+    expected = page.robot.body.clearance(page.robot, q, turned)
+    np.testing.assert_allclose(arm.robot.body.clearance(arm.robot, q, ball), expected, atol=1e-9)
+    here, there = arm.robot.collision.nearest_to_obstacle(q, ball), page.robot.collision.nearest_to_obstacle(q, turned)
+    assert here.distance == pytest.approx(there.distance, abs=1e-9)
+    fixed = arm.robot.body.of_joints(-1, 0).spheres["offset"]
+    np.testing.assert_allclose(
+        fixed @ page.robot.base.T, page.robot.body.of_joints(-1, 0).spheres["offset"], atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("frame", ["base", "page"])
+@each_arm
+def test_files_of_angles_and_of_places_in_the_base_frame_agree(tmp_path, name, frame):
+    arm, in_base = dt.load_arm(name, frame=frame), dt.load_arm(name)
+    q = in_base.robot.home + np.linspace(0, 0.4, 60)[:, None] * np.ones(in_base.robot.num_joints)
+    times = np.linspace(0, 3, 60)[:, None]
+    header = ",".join(["t", *(f"joint{k}" for k in range(in_base.robot.num_joints))])
+    np.savetxt(tmp_path / "angles.csv", np.hstack([times, q]), delimiter=",", header=header, comments="")
+    places = np.hstack([times, in_base.robot.end_effector(q)])
+    np.savetxt(tmp_path / "places.csv", places, delimiter=",", header="t,x,y,z", comments="")
+    (by_angles,) = dt.load_demonstrations(tmp_path / "angles.csv", arm=arm)
+    (by_places,) = dt.load_demonstrations(tmp_path / "places.csv", arm=arm)
+    np.testing.assert_allclose(by_places.positions, by_angles.positions, atol=1e-12)
+    np.testing.assert_allclose(arm.robot.end_effector(q), by_angles.positions, atol=1e-12)
+
+
+def test_orientations_turn_along_with_places(tmp_path):
+    half = np.sqrt(0.5)
+    rows = [(t, 0.3 + 0.1 * t, 0.0, 0.4, 0.0, half, 0.0, half) for t in np.linspace(0, 1, 30)]  # the hand's z along x
+    header = "t,x,y,z,qx,qy,qz,qw"
+    np.savetxt(tmp_path / "poses.csv", rows, delimiter=",", header=header, comments="")
+    frames: tuple[tuple[Literal["base", "page"], tuple[int, int, int]], ...]
+    frames = ("base", (1, 0, 0)), ("page", (0, -1, 0))
+    for frame, along in frames:
+        (take,) = dt.load_demonstrations(tmp_path / "poses.csv", arm=dt.load_arm("xarm7", frame=frame))
+        np.testing.assert_allclose(np.diff(take.positions, axis=0)[0] / 0.1 * 29, along, atol=1e-9)
+        assert take.orientations is not None
+        w, x, y, z = take.orientations[0]
+        axis = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
+        np.testing.assert_allclose(axis, along, atol=1e-9)
+
+
+@each_arm
+def test_a_placed_task_is_followed_by_the_same_joints_in_both_frames(name):
+    arm, page = dt.load_arm(name), dt.load_arm(name, frame="page")
+    joints = []
+    for one in (arm, page):
+        (take, *_) = one.place(dt.example("push_box"))
+        followed = one.follow(dt.Path(take.positions, take.times))
+        assert followed.error.max() < 1e-3
+        joints.append(followed.q)
+    np.testing.assert_allclose(joints[0], joints[1], atol=1e-6)
+
+
+def test_another_frame_is_refused_with_a_line():
+    with pytest.raises(ValueError, match=r"frame: found 'tool'; accepted: base, page"):
+        dt.load_arm("jaco", frame="tool")  # pyright: ignore[reportArgumentType]
