@@ -224,7 +224,7 @@ class ArmController:
                 if self._activity.let_go:
                     self.release()
                 else:
-                    flow.changed = True  # what was in the way of the motion need not be in that of its end
+                    flow.make(progress)  # what was in the way of the motion need not be in that of its end
             return tick.velocity.copy()
 
     def steps(self, q: ArrayLike, dt: float, num: int) -> Array:
@@ -245,7 +245,7 @@ class ArmController:
             return Phase.TOUCHED
         if activity.held:
             return Phase.HELD
-        if tick is not None and progress.ended:
+        if tick is not None and progress.ended and self._flow.is_settled:
             target = self._flow.image(progress)
             if np.linalg.norm((target - progress.course.q[-1]) * self.robot.levers) > self.settings.aside:
                 return Phase.ASIDE
