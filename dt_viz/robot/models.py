@@ -328,7 +328,9 @@ class _Given:
                     f"they stick out of the meshes by {1e3 * mean:.1f} mm in the mean, {1e3 * most:.0f} mm at most"
                 )
                 tell(0.75, "looking for links that always touch")
-                touching, touching_why = find_touching(solids, meshes, ranges, semantic, self.choice)
+                touching, touching_why = find_touching(
+                    solids, meshes, ranges, semantic, self.cover.protrusion, self.choice
+                )
             else:
                 body = _shipped_body(self.body)
                 touching, touching_why = frozenset(), "neighbours alone"
