@@ -125,7 +125,7 @@ def run(options: argparse.Namespace) -> int:
         rows.append(row | _row(passages) | {"frame × JACO": float(own / jacos), "cover mm": 1e3 * mean})
         for field in fields(Passage):
             arrays[f"{arm}_{field.name}"] = np.array([getattr(passage, field.name) for passage in passages])
-    write_npz(out, **arrays)
+        write_npz(out, **arrays)
     report(rows, markdown=True)
     return 0
 
