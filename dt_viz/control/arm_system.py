@@ -35,6 +35,8 @@ class Section:
     robot: Robot
     reference: Array
     """(n,) reference posture of h, rad."""
+    known: Array | None = None
+    """(K, n) postures on it, rad, where h has several minima; None is the reference."""
 
     def postures(self, x: Array) -> Array:
         """Compute Q(x), (*B, T, n) rad, for paths `x` (*B, T, 3), metres."""
@@ -47,6 +49,11 @@ class Section:
             miss = np.concatenate([-slope, targets - self.robot.end_effector(q)], axis=1)
             q = q + np.linalg.solve(K, miss[..., None])[:, :n, 0]
         return q.reshape(*x.shape[:-1], n)
+
+    def nearest(self, x: Array) -> Array:
+        """Return the known posture (n,) whose end effector is nearest to a place (3,), metres."""
+        known = self.reference[None] if self.known is None else self.known
+        return known[np.linalg.norm(self.robot.end_effector(known) - x, axis=1).argmin()]
 
     def velocities(self, q: Array, velocity: Array) -> Array:
         """Compute DQ·ẋ, (*B, n) rad/s, at postures q = Q(x) (*B, n) for the end effector's `velocity` ẋ (*B, 3), m/s.

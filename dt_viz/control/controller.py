@@ -88,7 +88,7 @@ class ArmController:
         """
         self.settings = settings = sized(settings or ControllerSettings(), follower.robot.size)
         self._follower, self._solved, self._lock = follower, solved, threading.RLock()
-        self._section = Section(follower.robot, follower.reference(solved.nominal))
+        self._section = _section(follower, solved)
         self._flow = ObstacleFlow(follower.whole_arm, solved.scenario.arm_avoidance, settings)
         self._feasible = FeasibleVelocities(follower.whole_arm, settings)
         self._activity = Activity(rollout=rollout)
@@ -112,7 +112,7 @@ class ArmController:
         Raises:
             UnreachableError: the arm cannot get to where the motions start.
         """
-        section = Section(self.robot, self._follower.reference(solved.nominal))
+        section = _section(self._follower, solved)
         with self._lock:
             before, progress, activity = self._solved, self._progress, self._activity
             stays = np.array_equal(self._section.reference, section.reference) and _same_course(before, solved)
@@ -224,7 +224,7 @@ class ArmController:
                 if self._activity.let_go:
                     self.release()
                 else:
-                    flow.changed = True  # what was in the way of the motion need not be in that of its end
+                    flow.make(progress)  # what was in the way of the motion need not be in that of its end
             return tick.velocity.copy()
 
     def steps(self, q: ArrayLike, dt: float, num: int) -> Array:
@@ -245,7 +245,7 @@ class ArmController:
             return Phase.TOUCHED
         if activity.held:
             return Phase.HELD
-        if tick is not None and progress.ended:
+        if tick is not None and progress.ended and self._flow.is_settled:
             target = self._flow.image(progress)
             if np.linalg.norm((target - progress.course.q[-1]) * self.robot.levers) > self.settings.aside:
                 return Phase.ASIDE
@@ -357,6 +357,11 @@ class ArmController:
         if activity.rest is not None and len(activity.rest) == len(state) - 3:
             state = base.caught(np.concatenate([hand, activity.rest]), stack.stacked.forward(hand))
         return towards(stack.system, self._section, q, state, self.settings, z)
+
+
+def _section(follower: Follower, solved: Solved) -> Section:
+    """Return the postures that a motion is followed with."""
+    return Section(follower.robot, follower.reference(solved.nominal), follower.at_ends(solved.nominal))
 
 
 def _same_course(before: Solved, after: Solved) -> bool:

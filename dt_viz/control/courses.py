@@ -129,9 +129,9 @@ def towards(
         evaluate = lambda i, u: system.transform.inverse(rays.at(i, u))[:, None, :3]  # noqa: E731
         bundle = evenly_sampled(evaluate, 1, settings.num_samples)
         times, fractions, path = rays.times(bundle.index, bundle.fraction), bundle.fraction, bundle.positions
-    # from the end, which is near the reference, backwards: the beginning may be far from the section's branch
+    # from the end, which is near a known posture, backwards: the beginning may be far from the section's branch
     along = rays.at(np.zeros(len(fractions), int), fractions)
-    joints = track(robot, path[::-1], section.reference, reference=section.reference).q[::-1]
+    joints = track(robot, path[::-1], section.nearest(path[-1]), reference=section.reference).q[::-1]
     turns = np.where(np.isinf(robot.lower), np.round((q - joints[0]) / (2 * np.pi)), 0.0)
     offset = q - joints[0] - 2 * np.pi * turns
     converged = convergence * np.log(max(float(np.abs(offset).max()) / settings.converged, 1.0))

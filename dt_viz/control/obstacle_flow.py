@@ -45,6 +45,11 @@ class ObstacleFlow:
         return self._clearing.cleared
 
     @property
+    def is_settled(self) -> bool:
+        """Whether the flow is the one that the obstacles ask for, not on its way there."""
+        return self._duration == self._clearing.duration
+
+    @property
     def transform(self) -> Diffeomorphism:
         """ψ_q, from the postures where the robot moves to those of its undisturbed motion."""
         return self._clearing.transform(self._arm, self._duration)
@@ -52,7 +57,7 @@ class ObstacleFlow:
     def settle(self, progress: Progress) -> None:
         """Make the flow for what has changed, at once."""
         if self.changed:
-            self._make(progress)
+            self.make(progress)
             self._duration = self._clearing.duration
 
     def advance(self, progress: Progress, dt: float) -> None:
@@ -61,7 +66,7 @@ class ObstacleFlow:
         if self.seen.speed > 0 and self.time > self.seen.time + settings.stale:
             self.see(self.seen.avoidance)
         if self.time >= self._made + settings.look_period and (self.seen.speed > 0 or self.changed):
-            self._make(progress)
+            self.make(progress)
         rise = self._clearing.duration - self._duration
         self._duration += min(max(rise, -settings.easing * dt), 2 * settings.easing * dt)
 
@@ -74,7 +79,7 @@ class ObstacleFlow:
             self._image = key, at
         return self._image[1]
 
-    def _make(self, progress: Progress) -> None:
+    def make(self, progress: Progress) -> None:
         """Find the way around obstacles for the motion that is ahead."""
         seen, settings, course, clock = self.seen, self._settings, progress.course, progress.clock
         turn = settings.turning * min(self.time - self._made, 1.0)

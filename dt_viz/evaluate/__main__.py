@@ -11,7 +11,7 @@ from pathlib import Path
 
 BAD_INPUT = 2
 """Exit status for what the user can put right; argparse uses the same."""
-COMMANDS = ("imitation", "around", "reactive", "table1", "train", "load")
+COMMANDS = ("imitation", "around", "reactive", "arms", "table1", "train", "load")
 FORMER: Mapping[str, tuple[str, ...]] = {
     "avoidance": ("around", "--space", "task"),
     "places": ("around",),

@@ -170,7 +170,9 @@ def run(options: argparse.Namespace) -> int:
     tasks, task = chosen_task(options)
     out, engine = ready_to_write(options.out, ".npz"), new_engine(tasks)
     try:
-        places = [_measured(engine, task, obstacles, options) for obstacles in _obstacles(task, options)]
+        chosen = {"space": options.space, "generator": options.generator}
+        avoided = (Avoidance(obstacles, **chosen) for obstacles in _obstacles(task, options))
+        places = [measured(engine, task, avoidance, on=not options.no_avoidance) for avoidance in avoided]
     except UnreachableError as error:
         print(f"no motion: the arm cannot reach the starts: {error}", file=sys.stderr)
         return 1
@@ -200,9 +202,13 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _measured(engine: Engine, task: Task, obstacles: Sequence[Obstacle], options: argparse.Namespace) -> Place:
-    avoidance = Avoidance(obstacles, space=options.space, generator=options.generator)
-    scenario, obstacle = avoiding(task, avoidance, on=not options.no_avoidance), Union(tuple(obstacles))
+def measured(engine: Engine, task: Task, avoidance: Avoidance, *, on: bool = True) -> Place:
+    """Measure a task's motions around obstacles, on the arm's meshes; with the avoidance off through them.
+
+    Raises:
+        UnreachableError: the arm cannot get to where the motions start.
+    """
+    scenario, obstacle = avoiding(task, avoidance, on=on), avoidance.avoided
     ends = obstacle.signed_distance(engine.nominal(scenario).learned.demonstrated.ends)
     frame, motions = engine.arm_motions(scenario)
     if frame.blocked:
@@ -253,14 +259,19 @@ def _obstacles(task: Task, options: argparse.Namespace) -> list[tuple[Obstacle, 
     drawn = []
     for nth in range(0 if options.obstacle else options.number):
         rng = np.random.default_rng(options.seed + 1_000_003 * nth)  # not the seed of another place
-        direction = unit(rng.normal(size=(count, 3)))
-        offset = options.spread * rng.uniform(size=(count, 1)) ** (1 / 3) * direction
+        offset = in_ball(rng, options.spread, count)
         along, sizes = rng.uniform(begin, end, size=count), rng.uniform(low, high, size=(count, 3))
         turns = np.roll(Rotation.from_rotvec(np.pi * rng.normal(size=(count, 3))).as_quat(), 1, axis=1)
         shapes = rng.choice(SHAPES, size=count) if options.shape == "any" else np.full(count, options.shape)
         centres = np.array([_on(task, s) for s in along]).reshape(-1, 3) + offset
         drawn.append([_shaped(*values) for values in zip(shapes, centres, sizes, turns, strict=True)])
     return [(middle,), *zip(*drawn, strict=True)]
+
+
+def in_ball(rng: np.random.Generator, radius: float, num: int) -> Array:
+    """Draw places (num, 3) evenly from a ball around 0, metres."""
+    direction = unit(rng.normal(size=(num, 3)))
+    return radius * rng.uniform(size=(num, 1)) ** (1 / 3) * direction
 
 
 def _on(task: Task, fraction: float) -> Array:

@@ -17,10 +17,11 @@ from dt_viz.avoidance.hand import Avoidance
 from dt_viz.avoidance.registry import AVOIDANCE
 from dt_viz.folders import default_cache_folder
 from dt_viz.learning.store import FitStore
-from dt_viz.robot.models import load_jaco
+from dt_viz.robot.models import load_arm
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.tasks import TASKS, Task, TaskEntry, known_tasks
 from dt_viz.session.engine import Engine
+from dt_viz.session.tasks_in_reach import in_reach
 
 Row = Mapping[str, str | float | None]
 """Row of a table: text or number of each column by its header, which names the unit."""
@@ -60,9 +61,14 @@ def chosen_task(options: argparse.Namespace) -> tuple[Mapping[str, TaskEntry], T
     return tasks, tasks[options.task]()
 
 
-def new_engine(tasks: Mapping[str, TaskEntry]) -> Engine:
-    """Return an engine that has computed nothing yet, with what was learned before on this machine."""
-    return Engine(tasks, FitStore(default_cache_folder()), load_jaco())
+def new_engine(tasks: Mapping[str, TaskEntry], arm: str = "jaco") -> Engine:
+    """Return an engine that has computed nothing yet, with what was learned before on this machine, tasks in reach.
+
+    Raises:
+        ArmError: there is no such arm.
+    """
+    robot = load_arm(arm)
+    return Engine(in_reach(tasks, robot), FitStore(default_cache_folder()), robot)
 
 
 def avoiding(task: Task, avoidance: Avoidance, *, on: bool = True) -> Scenario:
@@ -178,15 +184,18 @@ def unit_ms() -> float:
     return 1e3 * best
 
 
-def report(rows: Sequence[Row]) -> None:
+def report(rows: Sequence[Row], *, markdown: bool = False) -> None:
     """Print rows, if there are any, as a table whose header is the columns of the first, aligned left, then right."""
     if not rows:
         return
     PRINTED.append([{column: row.get(column) for column in rows[0]} for row in rows])
     texts = [[*rows[0]], *([as_text(cell) for cell in row.values()] for row in PRINTED[-1])]
     first, *widths = (max(map(len, column)) for column in zip(*texts, strict=True))
-    for name, *cells in texts:
-        print("  ".join([name.ljust(first), *map(str.rjust, cells, widths)]).rstrip())
+    aligned = [[name.ljust(first), *map(str.rjust, cells, widths)] for name, *cells in texts]
+    if markdown:
+        aligned.insert(1, ["-" * first, *("-" * (width - 1) + ":" for width in widths)])
+    for cells in aligned:
+        print(f"| {' | '.join(cells)} |" if markdown else "  ".join(cells).rstrip())
 
 
 def write_tables(path: Path) -> None:

@@ -176,14 +176,19 @@ class Bench:
 
     def undisturbed(self, start: int) -> tuple[Array, Array]:
         """The hand's places (T, 3), metres, and joints (T, n) at all ticks without a sphere."""
-        controller, q, passed = ArmController(self.follower, self.solved), self.starts[start], []
-        while len(passed) < SETTINGS.longest / TICK:
-            passed.append(q)
-            q = q + TICK * controller.step(q, TICK)
-            if controller.phase is Phase.RESTING:
-                break
-        joints = np.array(passed)
+        joints = driven(ArmController(self.follower, self.solved), self.starts[start])
         return self.robot.end_effector(joints), joints
+
+
+def driven(controller: ArmController, q: Array) -> Array:
+    """Return the joints (T, n), rad, at all ticks of a robot from a posture q (n,) on until it rests at the goal."""
+    passed = []
+    while len(passed) < SETTINGS.longest / TICK:
+        passed.append(q)
+        q = q + TICK * controller.step(q, TICK)
+        if controller.phase is Phase.RESTING:
+            break
+    return np.array(passed)
 
 
 def crossings(bench: Bench, speed: float, seed: int, num: int = 1) -> Iterator[tuple[Crossing, float]]:

@@ -112,6 +112,10 @@ class Follower:
         """
         return self._demonstrated(nominal.learned, nominal.posture).reference
 
+    def at_ends(self, nominal: Nominal) -> Array:
+        """The postures (R + 1, n), rad, at the task's starts and goal; raises as `reference`."""
+        return self._demonstrated(nominal.learned, nominal.posture).pins
+
     def behaving(self, nominal: Nominal, solution: Solution, *, exact: bool) -> Lift:
         """The joints along the motion with the behaviours of the end effector.
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-FORMAT = 2
+FORMAT = 3
 """Version of what is found of an arm and of its file; raised with every change, so that older files are not used."""
 MAX_BYTES = 500 * 10**6
 """Largest number of bytes that a file unpacks to."""

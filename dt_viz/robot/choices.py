@@ -14,7 +14,7 @@ import numpy as np
 
 from dt_viz.errors import FormatError
 from dt_viz.robot.body_points import BodyPoints
-from dt_viz.robot.collision import CollisionModel
+from dt_viz.robot.collision import SELF_MARGIN, CollisionModel
 from dt_viz.robot.kinematics import Kinematics
 from dt_viz.robot.link_distances import BetweenLinks, Poses
 from dt_viz.robot.meshes import LinkMesh
@@ -53,7 +53,7 @@ class ArmSearchSettings:
     num_postures: int = 150
     """Number of random postures in which distances of links are compared."""
     near: float = 0.02
-    """Distance below which two links count as near."""
+    """Distance below which two links count as near, at least."""
     always: float = 0.9
     """Part of the postures in which links are near that may touch."""
     spread: float = 0.35
@@ -138,12 +138,14 @@ def find_touching(
     meshes: Sequence[LinkMesh],
     ranges: Ranges,
     semantic: Element | None,
+    protrusion: float,
     settings: ArmSearchSettings,
 ) -> tuple[frozenset[frozenset[str]], str]:
     """Find pairs of links, besides neighbours, that may touch, by name, and say why.
 
     Those are pairs that an SRDF does not compare although they could meet, and pairs that are near in nearly all of
-    many random postures: a constant gap is no danger.
+    many random postures: a constant gap is no danger. Spheres that stick out of the links by `protrusion`, metres, take
+    one for less than `SELF_MARGIN` that is wider by twice this.
     """
     arm, rng = solids.robot, np.random.default_rng(2)
     told = [] if semantic is None else list(semantic.iter("disable_collisions"))
@@ -155,7 +157,7 @@ def find_touching(
     ]  # as `BetweenLinks` has them
     named = frozenset(pairs) & excepted
     pairs = [pair for pair in pairs if pair not in named]
-    measure, near = BetweenLinks(solids.links, named), settings.near * arm.reach
+    measure, near = BetweenLinks(solids.links, named), max(settings.near * arm.reach, SELF_MARGIN + 2 * protrusion)
     left, counts = np.arange(len(pairs)), np.zeros(len(pairs), int)
     for num, q in enumerate(ranges.random(rng, settings.num_postures), start=1):
         if not len(left):

@@ -23,7 +23,7 @@ from scipy.spatial import KDTree
 
 from dt_viz.kernels.arm import BODY_POINT
 from dt_viz.obstacles.triangles import grid_nodes, inside_of_grid, surface_samples
-from dt_viz.robot.meshes import LinkMesh
+from dt_viz.robot.meshes import LinkMesh, cells
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -129,8 +129,9 @@ def protrusion(tree: NDArray[np.void], meshes: Sequence[LinkMesh], spacing: floa
         for centre, radius in zip(centres, radii, strict=True):
             points = centre + radius * _evenly(int(4 * np.pi * (radius / (2 * spacing)) ** 2) + 8)
             others = around.query_ball_point(centre, radius + radii.max())
-            inside = np.linalg.norm(points[:, None] - centres[others], axis=2) < radii[others] - 1e-9
-            found.append(surface.query(points[~inside.any(axis=1)])[0])
+            apart, square = points - centre, centres[others] - centre  # products of small numbers keep their digits
+            beyond = (square**2).sum(axis=1) - 2 * apart @ square.T - (radii[others] - 1e-9) ** 2
+            found.append(surface.query(points[beyond.min(axis=1) >= -(radius**2)])[0])
     away = np.concatenate(found)
     return float(away.mean()), float(away.max())
 
@@ -202,8 +203,8 @@ def _greedy(points: Array, centres: Array, radii: Array) -> Indices:
 def _fitted(centres: Array, radii: Array, points: Array, slack: float) -> Spheres:
     """Give each sphere the radius for those of the points (N, 3) that are deepest in it, or nearest to it."""
     needed = np.zeros(len(radii))
-    _, member = np.unique(np.floor(points / GROUP).astype(int), axis=0, return_inverse=True)
-    for some in np.split(points[np.argsort(member.ravel())], np.cumsum(np.bincount(member.ravel()))[:-1]):
+    _, member = np.unique(cells(points, GROUP), return_inverse=True)
+    for some in np.split(points[np.argsort(member)], np.cumsum(np.bincount(member))[:-1]):
         middle = some.mean(axis=0)
         about = np.linalg.norm(centres - middle, axis=1) - radii
         near = np.flatnonzero(about <= about.min() + 2 * np.linalg.norm(some - middle, axis=1).max() + 1e-9)
@@ -221,7 +222,7 @@ def _on_surface(mesh: LinkMesh, spacing: float) -> Array:
 
 def _thinned(points: Array, cell: float) -> Array:
     """Keep one point in each cell of a grid."""
-    return points[np.unique(np.floor(points / cell).astype(int), axis=0, return_index=True)[1]]
+    return points[np.unique(cells(points, cell), return_index=True)[1]]
 
 
 def _area(mesh: LinkMesh) -> float:
@@ -307,8 +308,9 @@ def bounding_sphere(spheres: Spheres) -> Array:
     centre = spheres[:, :3].mean(axis=0)
     for step in range(2, 100):
         away = centres - centre
-        farthest = (np.sqrt(np.add.reduce(away * away, axis=1)) + radii).argmax()
-        length = np.linalg.norm(away[farthest])
+        apart = np.sqrt(np.add.reduce(away * away, axis=1))
+        farthest = (apart + radii).argmax()
+        length = apart[farthest]
         if length:
             centre = centre + away[farthest] * (1 + radii[farthest] / length) / step
     return np.append(centre, (np.linalg.norm(centres - centre, axis=1) + radii).max())

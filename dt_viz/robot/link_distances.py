@@ -22,7 +22,7 @@ import numpy as np
 from dt_viz.obstacles.shapes import Box, Cylinder, Obstacle, Sphere, rotation
 from dt_viz.obstacles.triangles import grid_nodes, inside_of_grid, surface_samples
 from dt_viz.robot.kinematics import Kinematics
-from dt_viz.robot.meshes import LinkMesh
+from dt_viz.robot.meshes import LinkMesh, cells
 
 if TYPE_CHECKING:
     from dt_viz.flows.fields import Array, Indices
@@ -75,11 +75,10 @@ class _Groups(NamedTuple):
     @classmethod
     def of(cls, points: Array, size: float, radii: Array | float = 0.0) -> _Groups:
         """Group the points (N, 3) by the cells, of this size, of a grid."""
-        cell = np.floor((points - points.min(axis=0)) / size).astype(np.intp)
-        _, member = np.unique(cell, axis=0, return_inverse=True)
-        order = np.argsort(member.ravel(), kind="stable")
+        _, member = np.unique(cells(points - points.min(axis=0), size), return_inverse=True)
+        order = np.argsort(member, kind="stable")
         points, radii = points[order], np.broadcast_to(radii, len(points))[order]
-        ends = np.cumsum(np.bincount(member.ravel()))
+        ends = np.cumsum(np.bincount(member))
         begins = np.r_[0, ends[:-1]]
         centres = (np.minimum.reduceat(points, begins) + np.maximum.reduceat(points, begins)) / 2
         apart = np.linalg.norm(points - np.repeat(centres, ends - begins, axis=0), axis=1) + radii

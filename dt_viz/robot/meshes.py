@@ -10,7 +10,7 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-    from dt_viz.flows.fields import Array
+    from dt_viz.flows.fields import Array, Indices
 
 T = TypeVar("T", bound="LinkMesh")
 
@@ -39,6 +39,13 @@ class VisualMesh(LinkMesh):
 
     colour: tuple[int, int, int] | None = None
     """Red, green and blue up to 255; None is the page's colour of an arm."""
+
+
+def cells(points: Array, size: float) -> Indices:
+    """Number the cells of a grid (N,), in the order of their places, that points (N, 3) are in."""
+    cell = np.floor(points / size).astype(np.intp)
+    cell -= cell.min(axis=0)
+    return np.ravel_multi_index(tuple(cell.T), tuple(cell.max(axis=0) + 1))
 
 
 def constant(values: ArrayLike, dtype: DTypeLike = float) -> NDArray[Any]:

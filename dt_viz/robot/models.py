@@ -156,19 +156,18 @@ def _load(name: str, progress: Progress | None) -> Robot:
     given = _Given(
         urdf, name, known.title, known.end_effector, known.home, known.front,
         urdf_path(name, known.srdf) if known.srdf else None, (package_dir,), levers=known.levers,
+        body=None if known.body is None else ASSETS / known.body,
     )  # fmt: skip
-    if not known.body:
-        return given.load(progress)
-    robot = given.made(_shipped_body(known.body))
-    return replace(
-        robot,
-        visuals=tuple(replace(mesh, colour=RING if mesh.name.startswith("ring") else None) for mesh in robot.visuals),
-    )
+    robot = given.load(progress)
+    if name != "jaco":
+        return robot
+    visuals = (replace(mesh, colour=RING if mesh.name.startswith("ring") else None) for mesh in robot.visuals)
+    return replace(robot, visuals=tuple(visuals))
 
 
-def _shipped_body(file: str) -> BodyPoints:
+def _shipped_body(file: Path) -> BodyPoints:
     """Load the body points that ``python -m assets.make_body_points`` makes."""
-    with np.load(ASSETS / file, allow_pickle=False) as data:
+    with np.load(file, allow_pickle=False) as data:
         spheres = np.zeros(len(data["joint"]), BODY_POINT)
         for name in BODY_POINT.names or ():
             spheres[name] = data[name]
@@ -261,6 +260,8 @@ class _Given:
     package_dirs: tuple[Path, ...]
     locked: Sequence[str] | Mapping[str, float] | None = None
     levers: tuple[float, ...] | None = None
+    body: Path | None = None
+    """File of body points; None makes them, and looks for links that always touch."""
     choice: ArmSearchSettings = field(default=ArmSearchSettings())
     cover: CoverSettings = field(default=CoverSettings())
 
@@ -280,21 +281,17 @@ class _Given:
             chain.tool,
         )
         told = [text.encode(), repr(chosen).encode(), self.srdf.read_bytes() if self.srdf else b""]
+        told += [self.body.read_bytes()] if self.body else []
         materials = (path for file in files if file.suffix.lower() == ".obj" for path in file.parent.glob("*.mtl"))
         key = arm_cache.digest([*told, *(file.read_bytes() for file in (*files, *sorted(materials)))])
         stored = default_cache_folder() / "arms" / f"{key}.npz"
         names = {"name": name, "title": self.title or name, "urdf": self.urdf, "package_dirs": self.package_dirs}
         robot = arm_cache.read(stored, names)
         if robot is None:
-            robot = self._robot(semantic, chain, text, name, None, tell)
+            robot = self._robot(semantic, chain, text, name, tell)
             arm_cache.write(stored, robot)
         tell(1.0, "")
         return robot
-
-    def made(self, body: BodyPoints) -> Robot:
-        """Make the arm with these body points; nothing is searched for."""
-        semantic, chain, text, _, name = self._read()
-        return self._robot(semantic, chain, text, name, body, lambda _fraction, _message: None)
 
     def _read(self) -> tuple[Element | None, ArmChain, str, tuple[Path, ...], str]:
         semantic = None if self.srdf is None else read_semantic(self.srdf)
@@ -304,9 +301,7 @@ class _Given:
             text, files = reduced(description, chain, self.package_dirs)
         return semantic, chain, text, files, self.name or description.name
 
-    def _robot(
-        self, semantic: Element | None, chain: ArmChain, text: str, name: str, body: BodyPoints | None, tell: Progress
-    ) -> Robot:
+    def _robot(self, semantic: Element | None, chain: ArmChain, text: str, name: str, tell: Progress) -> Robot:
         with naming(ArmError, self.urdf):
             tell(0.02, "reading the meshes")
             shapes = read_shapes(text, chain)
@@ -319,7 +314,7 @@ class _Given:
             num_fixed, fixed_why = count_fixed(arm)
             solids = CollisionModel(arm, meshes, num_fixed)
             cover_why = "as shipped"
-            if body is None:
+            if self.body is None:
                 body = BodyPoints(
                     covering_tree(
                         meshes,
@@ -333,8 +328,11 @@ class _Given:
                     f"they stick out of the meshes by {1e3 * mean:.1f} mm in the mean, {1e3 * most:.0f} mm at most"
                 )
                 tell(0.75, "looking for links that always touch")
-                touching, touching_why = find_touching(solids, meshes, ranges, semantic, self.choice)
+                touching, touching_why = find_touching(
+                    solids, meshes, ranges, semantic, self.cover.protrusion, self.choice
+                )
             else:
+                body = _shipped_body(self.body)
                 touching, touching_why = frozenset(), "neighbours alone"
             tell(0.85, "looking for a ready pose")
             solids.touching = touching

@@ -1,0 +1,260 @@
+"""Measure arms: loading, tasks in reach, random balls in the way, the robot in the loop, the frames of a drag.
+
+    python -m dt_viz.evaluate arms --arm panda ur5 --count 50 --seed 0 --out arms.npz
+
+Each arm follows the tasks that ship with DT-Viz, placed in its reach. A ball's middle is near the hand, or near a point
+of a random link that moves, in a random posture of a random task's motions; it is nearer to the arm there than the
+margin. Clearance is coal's distance from the collision shapes of the URDF, also between samples; the spheres that the
+avoidance computes with are not used. A ball that the arm cannot possibly pass is drawn again, and counted: one that is
+nearer than the margin to a link that no joint carries away, or to the arm in each of many postures with the hand at the
+goal, or at a start: inverse kinematics from random seeds, free of the arm itself and the table.
+
+The npz file holds for each arm NAME and its N balls the fields of `Passage`, ``NAME_task`` (N,), ``NAME_ball`` (N, 4) …
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from dt_viz.avoidance.avoidance import ArmAvoidance
+from dt_viz.control.controller import ArmController
+from dt_viz.evaluate.around import ALLOWANCE, in_ball, measured
+from dt_viz.evaluate.options import (
+    Row,
+    avoiding,
+    interval,
+    new_engine,
+    ready_to_write,
+    report,
+    whole_number,
+    write_npz,
+)
+from dt_viz.evaluate.reactive import SETTINGS, driven
+from dt_viz.flows.fields import Array
+from dt_viz.folders import default_cache_folder
+from dt_viz.motion.following import MAX_TRACKING_ERROR
+from dt_viz.motion.stack import LIVE
+from dt_viz.obstacles.shapes import Sphere, as_point
+from dt_viz.robot.choices import Ranges
+from dt_viz.robot.collision import CollisionModel
+from dt_viz.robot.cover import protrusion
+from dt_viz.robot.inverse_kinematics import UnreachableError, track
+from dt_viz.robot.models import ARMS
+from dt_viz.robot.robot import Robot
+from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.stack import with_avoidance
+from dt_viz.scenario.tasks import TASKS
+from dt_viz.session.engine import Engine
+from dt_viz.session.frame import Stage
+
+SPREAD = 0.05
+"""Largest distance of a ball's middle from the point that it is put at, metres, for an arm as large as the JACO."""
+NUM_POSTURES = 400
+"""Number of random postures of which one has to keep clear of a ball where a motion starts or ends."""
+NUM_FRAMES = 40
+"""Number of frames of each of two drags that are timed."""
+
+
+@dataclass(frozen=True)
+class Passage:
+    """One ball, the motions around it and the robot in the loop; lengths in metres, NaN where there is no motion."""
+
+    task: str
+    ball: tuple[float, float, float, float]
+    """Centre and radius."""
+    drawn_again: int
+    """Number of balls before it that cannot be passed."""
+    num_starts: int
+    num_moving: int
+    """Number of starts that the arm moves from."""
+    lacking: float
+    """What the nearest motion lacks of the margin, negative if it keeps more."""
+    clearance: float
+    """Smallest clearance of the motions."""
+    missed: float = np.nan
+    """Distance of the robot in the loop from the goal at its end."""
+    loop: float = np.nan
+    """Its smallest clearance."""
+
+    @property
+    def is_cleared(self) -> bool:
+        """Whether the arm moves from all starts, and keeps the margin."""
+        return self.num_moving == self.num_starts and self.lacking <= ALLOWANCE
+
+    def __str__(self) -> str:
+        motions = f"{self.num_moving} of {self.num_starts} motions keep {1e3 * self.clearance:.1f} mm"
+        return f"{self.task}: {motions}; loop {1e3 * self.loop:.1f} mm, goal missed by {1e3 * self.missed:.2f} mm"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Define the command's arguments."""
+    parser.add_argument("--arm", nargs="+", default=[*ARMS], metavar="NAME", help=f"(default: {' '.join(ARMS)})")
+    parser.add_argument("--task", nargs="+", choices=[*TASKS], default=[*TASKS], metavar="TASK", help="(default: all)")
+    parser.add_argument("--count", type=whole_number(1), default=50, help="balls for each (default: %(default)s)")
+    parser.add_argument("--seed", type=whole_number(0), default=0, help="of the balls (default: %(default)s)")
+    size = "range of their diameters in metres, for an arm as large as the JACO (default: 0.06,0.16)"
+    parser.add_argument("--size", type=interval(1e-3, 1), default=(0.06, 0.16), metavar="LOW[,HIGH]", help=size)
+    parser.add_argument("--first-load", action="store_true", help="also load each arm with an empty cache")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE.npz")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the command."""
+    out, jaco = ready_to_write(options.out, ".npz"), new_engine(TASKS)
+    engines = {arm: new_engine(TASKS, arm) for arm in options.arm}
+    rows, arrays = [], {}
+    for arm, engine in engines.items():
+        robot, passages = engine.follower.robot, []
+        row = {"arm": robot.title, "joints": robot.num_joints, "reach m": robot.reach}
+        row |= _loading(arm, first=options.first_load) | _following(engine, options.task)
+        for passage in _passages(engine, options):
+            print(f"{arm} {len(passages)} {passage}", flush=True)
+            passages.append(passage)
+        own, jacos = np.median([*_frames(engine, jaco, options)], axis=0)
+        mean, _ = protrusion(robot.body.spheres, robot.meshes)
+        rows.append(row | _row(passages) | {"frame × JACO": float(own / jacos), "cover mm": 1e3 * mean})
+        for field in fields(Passage):
+            arrays[f"{arm}_{field.name}"] = np.array([getattr(passage, field.name) for passage in passages])
+        write_npz(out, **arrays)
+    report(rows, markdown=True)
+    return 0
+
+
+def _loading(arm: str, *, first: bool) -> Row:
+    """Seconds that processes of their own load an arm in: from the user's cache folder, and with an empty one."""
+    code = "import sys, time; from dt_viz.robot.models import load_arm; began = time.perf_counter()\n"
+    code += "load_arm(sys.argv[1]); print(time.perf_counter() - began)"
+    kernels = os.environ.get("NUMBA_CACHE_DIR") or str(default_cache_folder() / "kernels")
+
+    def seconds(**environment: str) -> float:
+        known = {**os.environ, "NUMBA_CACHE_DIR": kernels, **environment}
+        done = subprocess.run([sys.executable, "-c", code, arm], env=known, stdout=subprocess.PIPE, check=True)
+        return float(done.stdout)
+
+    cached = seconds()
+    with TemporaryDirectory() as empty:
+        return {"load s": cached, "first s": seconds(XDG_CACHE_HOME=empty) if first else None}
+
+
+def _following(engine: Engine, tasks: Sequence[str]) -> Row:
+    """How many tasks the arm follows, by how much it misses them at most, and at which scale they are at least."""
+    worst, scales = [], []
+    for name in tasks:
+        nominal = engine.nominal(Scenario(name))
+        scales.append(engine.task(name).scale / TASKS[name]().scale / engine.follower.robot.size)
+        try:
+            worst.append(float(engine.follower.undisturbed(nominal).tracked.error.max()))
+        except UnreachableError:
+            worst.append(np.inf)
+    num = sum(error <= MAX_TRACKING_ERROR for error in worst)
+    return {"tasks followed": f"{num} of {len(worst)}", "off mm": 1e3 * max(worst), "scale": min(scales)}
+
+
+def _passages(engine: Engine, options: argparse.Namespace) -> Iterator[Passage]:
+    """Measure so many balls."""
+    rng, robot = np.random.default_rng(options.seed), engine.follower.robot
+    for _ in range(options.count):
+        name, again = str(rng.choice(options.task)), -1
+        task, nominal, can_be_passed = engine.task(name), engine.nominal(Scenario(name)), False
+        q = engine.follower.undisturbed(nominal).tracked.q.reshape(-1, robot.num_joints)
+        while not can_be_passed:
+            avoidance, again = ArmAvoidance(_ball(engine, q, rng, options.size)), again + 1
+            can_be_passed = _can_be_passed(robot, nominal.learned.demonstrated.ends, avoidance, rng)
+        (ball,), place = avoidance.obstacles, measured(engine, task, avoidance)
+        values = (*ball.position, ball.radius), again, len(place.ends) - 1, len(place.rollouts)
+        passage = Passage(name, *values, avoidance.margin - place.clearance, place.clearance)
+        if place.motions:
+            joints, goal = _in_the_loop(engine, avoiding(task, avoidance), int(rng.choice([*place.motions])))
+            missed = float(np.linalg.norm(robot.end_effector(joints[-1]) - goal))
+            passage = replace(passage, missed=missed, loop=robot.collision.nearest_to_obstacle(joints, ball).distance)
+        yield passage
+
+
+def _ball(engine: Engine, q: Array, rng: np.random.Generator, size: tuple[float, float]) -> Sphere:
+    """Draw a ball that meets the arm in one of the postures q (N, n)."""
+    robot, body = engine.follower.robot, engine.follower.whole_arm.body
+    while True:
+        posture = q[rng.integers(len(q))]
+        on_link = np.flatnonzero(body.joint == rng.choice(np.unique(body.joint)))
+        point = len(body.joint) - 1 if rng.random() < 0.5 else rng.choice(on_link)  # the hand is the last one
+        middle = body.positions(robot, posture)[point] + in_ball(rng, robot.size * SPREAD, 1)[0]
+        ball = Sphere(as_point(middle), robot.size * rng.uniform(*size))
+        if robot.collision.obstacle_distance(posture[None], ball)[0][0] < ArmAvoidance(ball).margin:
+            return ball
+
+
+def _can_be_passed(robot: Robot, places: Array, avoidance: ArmAvoidance, rng: np.random.Generator) -> bool:
+    """Whether the arm may move between places (R, 3) of the hand, metres, around a ball: see the file's first lines."""
+
+    def keeps_clear(solids: CollisionModel, q: Array) -> bool:
+        return solids.nearest_to_obstacle(q[None], avoidance.avoided).distance >= avoidance.margin
+
+    def is_sound(q: Array) -> bool:
+        near = robot.collision.nearest_to_itself(q[None])
+        return (near is None or near.distance > 0) and robot.collision.nearest_to_table(q[None]).distance >= 0
+
+    fixed = [mesh for mesh in robot.meshes if mesh.joint < robot.num_fixed]
+    if not keeps_clear(CollisionModel(robot, fixed, robot.num_fixed), robot.home):
+        return False
+    for place in places:
+        seeds = Ranges.of(robot.lower, robot.upper).random(rng, NUM_POSTURES)
+        found = track(robot, np.broadcast_to(place, (len(seeds), 1, 3)), seeds)
+        q = found.q[found.error[:, 0] < MAX_TRACKING_ERROR, 0]
+        if not any(keeps_clear(robot.collision, one) and is_sound(one) for one in q):
+            return False
+    return True
+
+
+def _in_the_loop(engine: Engine, scenario: Scenario, rollout: int) -> tuple[Array, Array]:
+    """Joints (T, n), rad, of the robot in the loop from the start of a rollout on, and the goal (3,), metres."""
+    solved = engine.solved(scenario, LIVE)
+    assert solved.arm is not None
+    q, controller = solved.arm.p[np.argmax(solved.arm.index == rollout)], ArmController(engine.follower, solved)
+    controller.begin(q, rollout)
+    return driven(controller, q), solved.nominal.goal
+
+
+def _frames(engine: Engine, jaco: Engine, options: argparse.Namespace) -> Iterator[tuple[float, float]]:
+    """Processor times, seconds, of the same drag's frames of an arm and of the JACO, in turn."""
+    for task in options.task[:2]:
+        yield from zip(*(_drag(one, task, options.size[-1]) for one in (engine, jaco)), strict=True)
+
+
+def _drag(engine: Engine, name: str, diameter: float) -> Iterator[float]:
+    """Drag a ball on a loop through a task's motions; yields the processor time of each frame but the first."""
+    size, task, passing = engine.follower.robot.size, engine.task(name), None
+    ball = Sphere(task.obstacle_position, size * diameter)
+    scenario = avoiding(task, ArmAvoidance(ball))
+    for a in np.linspace(0, 2 * np.pi, NUM_FRAMES + 1):
+        aside = 0.06 * size * np.array([np.sin(a), 0.3 * np.sin(2 * a), 1 - np.cos(a)])
+        stack = with_avoidance(scenario, obstacles=(ball.moved(as_point(np.asarray(ball.position) + aside)),))
+        began = time.thread_time()
+        frames = engine.frames(replace(scenario, stack=stack, passing=passing))
+        frame = next(frame for frame in frames if frame.stage is Stage.LIVE)
+        if passing is not None:
+            yield time.thread_time() - began
+        passing = frame.passing
+
+
+def _row(passages: Sequence[Passage]) -> Row:
+    """Row of the table, as far as balls go."""
+    num = len(passages)
+    return {
+        "cleared": f"{sum(passage.is_cleared for passage in passages)} of {num}",
+        "least mm": 1e3 * float(np.nanmin([passage.clearance for passage in passages])),
+        "some starts": sum(0 < passage.num_moving < passage.num_starts for passage in passages),
+        "no way": sum(passage.num_moving == 0 for passage in passages),
+        "drawn again": sum(passage.drawn_again for passage in passages),
+        "loop at goal": f"{sum(passage.missed <= SETTINGS.at_goal for passage in passages)} of {num}",
+        "loop least mm": 1e3 * float(np.nanmin([passage.loop for passage in passages])),
+    }
