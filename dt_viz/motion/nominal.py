@@ -11,10 +11,11 @@ import numpy as np
 from dt_viz.avoidance.passing import Posture
 from dt_viz.avoidance.start_status import StartStatus, start_warnings
 from dt_viz.flows.diffeomorphisms import Identity
-from dt_viz.flows.fields import Array, Mask
+from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.flows.rollouts import Bundle, Rays, evenly_sampled
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.interface import AnyImitation
+from dt_viz.learning.poses import Poses
 from dt_viz.scenario.scenario import Start
 from dt_viz.scenario.tasks import Task
 from dt_viz.warning import MotionWarning
@@ -71,6 +72,12 @@ class Learned:
     def places(self, base_states: Array) -> Array:
         """Places (N, 3), metres, of base states (N, k): the first coordinates of ψ⁻¹."""
         return self.system.transform.inverse(base_states)[:, :3]
+
+    @cached_property
+    def poses(self) -> Poses | None:
+        """The motions of the hand's pose, in the world; None of motions without orientations."""
+        predictions = getattr(self.system.base, "predictions", None)
+        return getattr(predictions, "poses", None)
 
     @property
     def labels(self) -> tuple[float, ...]:
@@ -218,6 +225,14 @@ class Nominal:
     def ends(self) -> Array:
         """(R + 1, 3) starts and goal, metres."""
         return np.concatenate([self.starts, [self.goal]])
+
+    def orientations_at(self, index: Indices, fraction: Array) -> Array | None:
+        """Orientations (N, 4) of the hand, wxyz, of rollouts (N,) at fractions (N,) of their rays.
+
+        What is stacked moves places and leaves them as they are. None of motions without orientations.
+        """
+        poses = self.learned.poses
+        return None if poses is None else poses.predicted(self.rays.at(index, fraction)[:, 3:])
 
     def rays_between(self, ends: Array) -> Rays:
         """Rays of motions that begin and end elsewhere: `ends` (R + 1, 3), metres; see `ends`."""
