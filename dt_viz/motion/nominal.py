@@ -36,6 +36,8 @@ class NominalTrajectory:
     """(n,) where on its base ray the samples are."""
     positions: Array
     """(n, 3) samples, metres."""
+    orientations: Array | None = None
+    """(n, 4) orientations of the hand there, wxyz; None where none were learned."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +106,10 @@ class Learned:
         images = self.system.transform.forward(states)
         rays = Rays(images, self.system.base)
         bundle = evenly_sampled(lambda i, u: self.places(rays.at(i, u))[:, None], len(states), num_samples)
-        parts = states[:, :3], images, bundle.split(bundle.fraction), bundle.paths
+        turns: Sequence[Array | None] = [None] * len(states)
+        if self.poses is not None:
+            turns = bundle.split(self.poses.predicted(rays.at(bundle.index, bundle.fraction)[:, 3:]))
+        parts = states[:, :3], images, bundle.split(bundle.fraction), bundle.paths, turns
         return tuple(NominalTrajectory(*part) for part in zip(*parts, strict=True))
 
 
@@ -215,6 +220,12 @@ class Nominal:
         fractions, positions = zip(*((each.fraction, each.positions) for each in self.trajectories), strict=True)
         index = np.repeat(np.arange(len(fractions)), [len(fraction) for fraction in fractions])
         return Bundle(index, np.concatenate(fractions), np.concatenate(positions)[:, None])
+
+    @cached_property
+    def orientations(self) -> tuple[Array, ...] | None:
+        """Orientations of the hand along each rollout, (T_i, 4), wxyz; None where none were learned."""
+        turns = tuple(each.orientations for each in self.trajectories if each.orientations is not None)
+        return turns or None
 
     @cached_property
     def paths(self) -> tuple[Array, ...]:

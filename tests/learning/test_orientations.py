@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from turning import GOAL, turning_takes
 
 import dt_viz as dt
 from dt_viz.flows.rotations import apart, exponential, logarithm, mean_orientation, nearest, quaternions, rotation
@@ -13,21 +14,6 @@ from dt_viz.learning.patterns import AugmentedSettings, StartProcess
 from dt_viz.learning.preparation import PreparationSettings, prepare
 
 RNG = np.random.default_rng(5)
-GOAL = np.array([0.1, 0.9, -0.3, 0.2]) / np.linalg.norm([0.1, 0.9, -0.3, 0.2])
-
-
-def turning_takes(num=5, turn=1.5, seed=3):
-    """Takes (T, 3) that bend and turn the hand by about `turn` rad about an axis that wanders, each a little else."""
-    rng, u, takes = np.random.default_rng(seed), np.linspace(1.0, 0.0, 150), []
-    for k in range(num):
-        start = np.array([0.4, 0.1, 0.2]) + 0.03 * rng.normal(size=3)
-        path = u[:, None] * start + 0.1 * np.sin(np.pi * u)[:, None] * np.array([0.0, 1.0, 0.5])
-        axis = np.array([0.3, 1.0, 0.2]) + 0.1 * rng.normal(size=3)
-        vectors = turn * (u**1.3)[:, None] * axis / np.linalg.norm(axis) + 0.1 * np.sin(3 * u)[:, None] * [0, 0, 1]
-        takes.append(Demonstration(np.linspace(0, 4, 150), path, f"{k}", exponential(GOAL, vectors)))
-    return tuple(takes)
-
-
 TAKES = turning_takes()
 
 
