@@ -263,6 +263,7 @@ def _prepare(fits: FitStore, task: Task, robot: Robot, leaving: threading.Event)
     """Learn the first task and compile what a drag repeats, beside the server, which answers meanwhile."""
     from dt_viz.errors import UnwantedError  # noqa: PLC0415
     from dt_viz.learning.imitation import ImitationError  # noqa: PLC0415
+    from dt_viz.learning.state import has_orientations  # noqa: PLC0415
 
     bar = _Bar(f"Learning {task.title}")
 
@@ -272,7 +273,8 @@ def _prepare(fits: FitStore, task: Task, robot: Robot, leaving: threading.Event)
         bar(fraction, message)
 
     try:
-        fits.get(task.demonstrations, progress=progress)
+        if not has_orientations(task.demonstrations):  # else it is learned in milliseconds
+            fits.get(task.demonstrations, progress=progress)
         _compile(robot, leaving)
     except UnwantedError:
         pass

@@ -103,6 +103,8 @@ class Kind(Enum):
     """The arm cannot reach a place."""
     PATH_MISSED = Concern.CAUTION
     """The joints do not lead the hand along its path."""
+    HAND_TURNED = Concern.CAUTION
+    """The joints do not turn the hand as the motion does."""
     NO_WAY = Concern.CAUTION
     """The arm, free at its ends, finds no motion between them that does not touch an obstacle."""
     ARM_BLOCKED = Concern.CAUTION

@@ -33,6 +33,7 @@ def five_joints() -> Robot:
         name="five",
         end_effector_offset=turn @ jaco.end_effector_offset + shift,
         hand_axis=turn @ jaco.hand_axis,
+        hand_rotation=turn @ jaco.hand_rotation,
         body=BodyPoints(spheres),
         meshes=tuple(map(fixed, jaco.meshes)),
         visuals=tuple(map(fixed, jaco.visuals)),

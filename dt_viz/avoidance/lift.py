@@ -71,10 +71,17 @@ class Lift:
 
 
 def _fields(tracked: TrackedPath) -> tuple[NDArray[Any], ...]:
-    return tracked.q, tracked.error, tracked.limits_hit, tracked.manipulability, tracked.damped
+    return tracked.q, tracked.error, tracked.limits_hit, tracked.manipulability, tracked.damped, tracked.turned
 
 
-def lift(robot: Robot, fractions: Array, paths: Array, reference: Array, initial: Array | None = None) -> Lift:
+def lift(
+    robot: Robot,
+    fractions: Array,
+    paths: Array,
+    reference: Array,
+    initial: Array | None = None,
+    orientations: Array | None = None,
+) -> Lift:
     """Follow rollouts with the joints.
 
     Args:
@@ -83,6 +90,8 @@ def lift(robot: Robot, fractions: Array, paths: Array, reference: Array, initial
         paths: (R, T, 3) end effector there, metres.
         reference: (n,) posture that the arm stays near to, rad.
         initial: (R, T, n) joints of nearby paths to begin from, rad.
+        orientations: (R, T, 4) of the hand there, wxyz; None wants none.
     """
     start, every = np.broadcast_to(reference, (len(paths), robot.num_joints)), np.ones(len(paths), bool)
-    return Lift(fractions, track(robot, paths, start, initial, reference=start), reference, every, every)
+    tracked = track(robot, paths, start, initial, reference=start, orientations=orientations)
+    return Lift(fractions, tracked, reference, every, every)

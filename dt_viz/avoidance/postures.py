@@ -76,7 +76,9 @@ class ReferencePostures:
         return self.away + (self._stuck * lacking).mean(axis=1)
 
 
-def reference_postures(robot: Robot, usual: Array, starts: Array, path: Array) -> ReferencePostures:
+def reference_postures(
+    robot: Robot, usual: Array, starts: Array, path: Array, orientations: Array | None = None
+) -> ReferencePostures:
     """Find reference postures for the motions of a task.
 
     Random postures are brought to the mean start, then each follows all starts and the mean motion. Those stay that do
@@ -88,6 +90,7 @@ def reference_postures(robot: Robot, usual: Array, starts: Array, path: Array) -
         usual: (n,) the posture that the arm usually stays near to, rad.
         starts: (R, 3) places where motions start, metres.
         path: (T, 3) the mean motion, metres; its end is the goal.
+        orientations: (R + T, 4) of the hand at starts and path, wxyz; None wants none.
 
     Returns:
         The reference postures, whose pins are those at the starts and at the goal.
@@ -95,12 +98,14 @@ def reference_postures(robot: Robot, usual: Array, starts: Array, path: Array) -
     rng = np.random.default_rng(0)  # the same for each visitor
     scale = rng.uniform(*SPREAD, size=(NUM_TRIED, 1))
     tried = robot.clip(usual + scale * rng.normal(size=(NUM_TRIED, robot.num_joints)))
-    at_start = track(robot, np.broadcast_to(starts.mean(axis=0), (NUM_TRIED, 1, 3)), tried)
+    wanted = None if orientations is None else np.broadcast_to(orientations[len(starts)], (NUM_TRIED, 1, 4))
+    at_start = track(robot, np.broadcast_to(starts.mean(axis=0), (NUM_TRIED, 1, 3)), tried, orientations=wanted)
     reaches = (at_start.error < REACHED) & ~at_start.limits_hit & ~at_start.damped
     references = np.concatenate([usual[None], at_start.q[reaches[:, 0], 0]])
     places = np.concatenate([starts, path])
     paths = np.broadcast_to(places, (len(references), *places.shape))
-    tracked = track(robot, paths, references, reference=references)
+    wanted = None if orientations is None else np.broadcast_to(orientations, (*paths.shape[:2], 4))
+    tracked = track(robot, paths, references, reference=references, orientations=wanted)
     moving = robot.links.with_end_effector(robot)
     heights = (moving.positions(robot, tracked.q)[..., 2] - moving.radius).min(axis=(1, 2))
     follows = (tracked.error < REACHED) & ~tracked.limits_hit & ~tracked.damped

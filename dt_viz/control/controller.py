@@ -356,7 +356,8 @@ class ArmController:
             state = base.states(hand, like=images[activity.rollout % len(images)])
         if activity.rest is not None and len(activity.rest) == len(state) - 3:
             state = base.caught(np.concatenate([hand, activity.rest]), stack.stacked.forward(hand))
-        return towards(stack.system, self._section, q, state, self.settings, z)
+        poses = self._solved.nominal.learned.poses
+        return towards(stack.system, self._section, q, state, self.settings, z, poses)
 
 
 def _section(follower: Follower, solved: Solved) -> Section:

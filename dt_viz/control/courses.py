@@ -14,6 +14,7 @@ from dt_viz.control.settings import ControllerSettings
 from dt_viz.flows.fields import Array
 from dt_viz.flows.rollouts import ARRIVED, Rays, evenly_sampled
 from dt_viz.flows.systems import DiffeomorphicSystem
+from dt_viz.learning.poses import Poses
 from dt_viz.robot.inverse_kinematics import track
 from dt_viz.robot.retiming import within_velocity_limits
 from dt_viz.robot.robot import Robot
@@ -106,6 +107,7 @@ def towards(
     state: Array,
     settings: ControllerSettings,
     z: Array | None = None,
+    poses: Poses | None = None,
 ) -> Course:
     """Make the motion of a system that a robot follows on a section, onto which it converges.
 
@@ -118,6 +120,7 @@ def towards(
         state: (k,) in which the hand is.
         settings: τ, and how a course is sampled.
         z: (k,) base coordinates to begin from; None are those of the state.
+        poses: gives the orientations of the hand; None wants none.
     """
     robot, base, convergence = section.robot, system.base, settings.convergence
     z0 = system.transform.forward(state) if z is None else z
@@ -131,7 +134,9 @@ def towards(
         times, fractions, path = rays.times(bundle.index, bundle.fraction), bundle.fraction, bundle.positions
     # from the end, which is near a known posture, backwards: the beginning may be far from the section's branch
     along = rays.at(np.zeros(len(fractions), int), fractions)
-    joints = track(robot, path[::-1], section.nearest(path[-1]), reference=section.reference).q[::-1]
+    wanted = None if poses is None else poses.predicted(along[::-1, 3:])
+    near = section.nearest(path[-1])
+    joints = track(robot, path[::-1], near, reference=section.reference, orientations=wanted).q[::-1]
     turns = np.where(np.isinf(robot.lower), np.round((q - joints[0]) / (2 * np.pi)), 0.0)
     offset = q - joints[0] - 2 * np.pi * turns
     converged = convergence * np.log(max(float(np.abs(offset).max()) / settings.converged, 1.0))

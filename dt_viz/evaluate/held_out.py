@@ -19,9 +19,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from dt_viz.flows.fields import Array
+from dt_viz.flows.rotations import apart, logarithm
 from dt_viz.flows.systems import DiffeomorphicSystem
+from dt_viz.learning.augmented import AugmentedImitation
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.interface import AnyImitation
+from dt_viz.learning.poses import Poses
 from dt_viz.metrics import arc_length, discrete_frechet, resample_by_arc_length, rms_at_equal_times
 
 WAYS = ("learned", "mean", "nearest")
@@ -43,6 +46,8 @@ class Followed:
     """(T, d), metres, of each of `WAYS`."""
     times: Mapping[str, Array]
     """(T,), seconds."""
+    degrees: Mapping[str, Array]
+    """Of "learned" and "mean", see `degrees_off`; empty without orientations."""
 
     def frechet(self, way: str) -> float:
         """Discrete Fréchet distance from the demonstration, metres."""
@@ -88,8 +93,36 @@ def follow(demonstrations: Sequence[Demonstration], learn: Learn, folds: int) ->
                 imitation.state,
                 {way: path for way, (path, _) in by_way.items()},
                 {way: times for way, (_, times) in by_way.items()},
+                degrees_off(imitation, others, demonstrations[i]),
             )
     return [followed[i] for i in range(len(demonstrations))]
+
+
+def degrees_off(
+    imitation: AnyImitation, others: Sequence[Demonstration], demonstration: Demonstration
+) -> dict[str, Array]:
+    """Angles (`NUM_COMPARED`,), degrees, from the hand's orientation in a demonstration, at equal parts of the way.
+
+    The way is that of the hand's pose, in which a turn counts a length (`AugmentedSettings.turn_length`). "learned" is
+    what is predicted for the demonstration's start, "mean" the mean of the others there. Empty without orientations.
+    """
+    poses = imitation.poses if isinstance(imitation, AugmentedImitation) else None
+    if poses is None or demonstration.orientations is None:
+        return {}
+    phase = imitation.system.base.left(state := imitation.system.base.states(demonstration.positions[0]))
+    rest = np.tile(state[3:], (NUM_COMPARED, 1))
+    rest[:, 0] = phase * np.linspace(1, 0, NUM_COMPARED)
+    wanted = poses.orientations(_turns(poses, demonstration))
+    mean = poses.orientations(np.mean([_turns(poses, other) for other in others], axis=0))
+    found = {"learned": poses.predicted(rest), "mean": mean}
+    return {way: np.rad2deg(apart(orientations, wanted)) for way, orientations in found.items()}
+
+
+def _turns(poses: Poses, demonstration: Demonstration) -> Array:
+    """Rotation vectors (`NUM_COMPARED`, 3) of a demonstration, times a radius, evenly along the way of its pose."""
+    assert demonstration.orientations is not None
+    vectors = poses.imitation.radius * logarithm(poses.goal_orientation, demonstration.orientations)
+    return resample_by_arc_length(np.hstack([demonstration.positions, vectors]), NUM_COMPARED)[:, 3:]
 
 
 def folds_of(num: int, folds: int) -> list[range]:

@@ -16,9 +16,10 @@ For each file the folder gets an npz, all lengths in the file's own unit (LASA: 
 
 With ``--leave-one-out`` each demonstration is also followed by the motion learned from the others, and by two ways that
 need no learning (see `dt_viz.evaluate.held_out`): SHAPE-held-out.npz holds ``learned_i``, ``mean_i`` and ``nearest_i``
-(T, d) for each demonstration i, and ``learned_times_i`` … (T,). ``figures.json`` holds what the tables show,
-``shapes.png`` all shapes (the paper's fig. 5), and ``worst.png`` the held-out demonstrations that are met worst for the
-extent of their shape.
+(T, d) for each demonstration i, and ``learned_times_i`` … (T,); of demonstrations with the hand's orientation also
+``learned_degrees_i`` and ``mean_degrees_i`` (N,), its angles from the demonstration's. ``figures.json`` holds what the
+tables show, ``shapes.png`` all shapes (the paper's fig. 5), and ``worst.png`` the held-out demonstrations that are met
+worst for the extent of their shape.
 """
 
 from __future__ import annotations
@@ -37,7 +38,16 @@ import numpy as np
 
 from dt_viz.evaluate import figures
 from dt_viz.evaluate.figures import FigurePanel
-from dt_viz.evaluate.held_out import WAYS, Followed, Learn, begun, follow, frechet, rollouts_from
+from dt_viz.evaluate.held_out import (
+    WAYS,
+    Followed,
+    Learn,
+    begun,
+    degrees_off,
+    follow,
+    frechet,
+    rollouts_from,
+)
 from dt_viz.evaluate.options import InputError, ready_folder, report, whole_number, write_json, write_npz
 from dt_viz.files.archives import LASA_UNITS
 from dt_viz.flows.diffeomorphisms import min_det_jacobian, round_trip_error
@@ -115,6 +125,7 @@ def run(options: argparse.Namespace) -> int:
     panels: list[FigurePanel] = []
     held_out: list[dict[str, Any]] = []
     cases: list[tuple[float, FigurePanel]] = []
+    turns: list[dict[str, Any]] = []
     for source in sources:
         name, began = source.path.stem, time.perf_counter()
         try:
@@ -132,6 +143,8 @@ def run(options: argparse.Namespace) -> int:
         rows.append(row)
         write_npz(folder / f"{name}.npz", **arrays)
         panels.append(FigurePanel(name, {"demonstration": _paths(source), "learned": rollouts}))
+        if imitation.has_orientation:
+            turns.append(turn_row(name, imitation, source, followed))
         if holds_out:
             write_npz(folder / f"{name}-held-out.npz", **_arrays(followed, source.unit))
             held_out.append(summed_up(name, _num_folds(source, options.folds), followed))
@@ -143,14 +156,27 @@ def run(options: argparse.Namespace) -> int:
         print(f"fit, median: {np.median([row.fit_seconds for row in rows]):.2f} s")
         if holds_out:
             _report_held_out(held_out)
+        _report_turns(turns)
         chosen = {"state": options.state, "objective": options.objective}
-        write_json(folder / "figures.json", {**chosen, "shapes": shapes, "held_out": held_out})
-        if figures.can_draw():
-            figures.save(figures.panels(panels), folder / "shapes.png")
-            if cases:
-                worst = [panel for _, panel in worst_of(cases)]
-                figures.save(figures.panels(worst, columns=3), folder / "worst.png")
+        write_json(folder / "figures.json", {**chosen, "shapes": shapes, "held_out": held_out, "turns": turns})
+        _draw(folder, panels, cases)
     return 0 if len(rows) == len(sources) else 2
+
+
+def _draw(folder: Path, panels: Sequence[FigurePanel], cases: Sequence[tuple[float, FigurePanel]]) -> None:
+    """Draw all shapes, and the worst cases if there are any, where matplotlib is installed."""
+    if figures.can_draw():
+        figures.save(figures.panels(panels), folder / "shapes.png")
+        if cases:
+            worst = [panel for _, panel in worst_of(cases)]
+            figures.save(figures.panels(worst, columns=3), folder / "worst.png")
+
+
+def _report_turns(rows: Sequence[dict[str, Any]]) -> None:
+    """Print the rows of `turn_row`, if there are any."""
+    if rows:
+        print("\nthe hand's orientation, degrees from the demonstration's at equal parts of the way")
+        report(_with_means(rows))
 
 
 def _report_held_out(rows: Sequence[dict[str, Any]]) -> None:
@@ -199,6 +225,24 @@ def measured(
     return figures, arrays, tuple(rollouts)
 
 
+def turn_row(
+    name: str, imitation: AnyImitation, source: Source, followed: Sequence[Followed]
+) -> dict[str, float | str]:
+    """Row of the table of orientations: medians and largest angles in-sample, held out, and of the mean of the others.
+
+    All over the samples of all demonstrations, degrees.
+    """
+    demonstrations = source.demonstrations
+    own = np.stack([degrees_off(imitation, demonstrations, each)["learned"] for each in demonstrations])
+    columns = {"in_sample": own}
+    for title, way in (("held_out", "learned"), ("mean_of_others", "mean")):
+        if followed:
+            columns[title] = np.stack([f.degrees[way] for f in followed])
+    figures = {"median": np.median, "largest": np.max}
+    values = {f"{title}_{figure}": float(f(off)) for title, off in columns.items() for figure, f in figures.items()}
+    return {"name": name, **values}
+
+
 def _states(imitation: AnyImitation, paths: Sequence[Array]) -> Array:
     """States (N, d) of the certificates' grid; augmented ones at each of several phases."""
     dim = len(imitation.goal)
@@ -231,6 +275,7 @@ def _paths(source: Source) -> list[Array]:
 def _arrays(followed: Sequence[Followed], unit: float) -> dict[str, Array]:
     """Arrays of the file of what was held out; lengths in so many metres."""
     paths = {f"{way}_{i}": f.paths[way] / unit for i, f in enumerate(followed) for way in WAYS}
+    paths |= {f"{way}_degrees_{i}": off for i, f in enumerate(followed) for way, off in f.degrees.items()}
     return paths | {f"{way}_times_{i}": f.times[way] for i, f in enumerate(followed) for way in WAYS}
 
 

@@ -11,18 +11,20 @@ from dt_viz.kernels.arm import Array, Joints
 from dt_viz.kernels.blocks import LANES, MOST_JOINTS, block_of, chain, keep, load, put, turning
 from dt_viz.kernels.compiled import compiled, kernel
 from dt_viz.kernels.distances import Record
+from dt_viz.kernels.symmetric import invert, product, times
 
 BLOCK = block_of(
     ("target", (3,)),  # metres
+    ("turn", (3, 3)),  # orientation of the last joint that is wanted: [column, component]
     ("error", (3,)),  # metres
     ("reference", (MOST_JOINTS,)),
     ("soft_lower", (MOST_JOINTS,)),
     ("soft_upper", (MOST_JOINTS,)),
-    ("wanted", (3,)),  # direction of the hand
+    ("wanted", (3,)),  # direction of the hand, or rotation vector to the orientation that is wanted
     ("flexibility", ()),  # 1/w_d
-    ("direction", (3,)),  # of the hand
+    ("direction", (3,)),  # of the hand, or zero
     ("J", (MOST_JOINTS, 3)),  # velocity of the end effector for each joint's
-    ("D", (MOST_JOINTS, 3)),  # that of the hand's direction
+    ("D", (MOST_JOINTS, 3)),  # that of the hand's direction, or its angular velocity
     ("mobility", (MOST_JOINTS,)),  # diagonal of the inverse of H without its part of the direction
     ("G", (MOST_JOINTS, 3)),
     ("H_inv_J", (MOST_JOINTS, 3)),
@@ -72,7 +74,7 @@ class Postures(NamedTuple):
     soft_upper: Array
     """(B, n) rad."""
     direction_weight: Array
-    """(B,) w_d, against 1 for the reference."""
+    """(B,) w_d, against 1 for the reference; of the orientation where one is wanted."""
 
 
 @compiled
@@ -89,7 +91,17 @@ def _aim(postures: Postures, which: int, lane: int, block: Record) -> None:
 
 
 @compiled
-def _newton(arm: TrackingArm, gain: float, block: Record) -> None:
+def _want(begin: Array, end: Array, part: float, lane: int, block: Record) -> None:
+    """Take what is between two targets into a lane: places (3,), or these and orientations (12,), by columns."""
+    target, turn = block.target, block.turn
+    for c in range(3):
+        target[c, lane] = begin[c] + part * (end[c] - begin[c])
+    for c in range(3, len(begin)):
+        turn[c // 3 - 1, c % 3, lane] = begin[c] + part * (end[c] - begin[c])
+
+
+@compiled
+def _newton(arm: TrackingArm, gain: float, turns: bool, block: Record) -> None:
     """Make one damped resolved-rate step towards the targets and improve the posture in the null space.
 
     With e = target − x(q), H ≈ ∇²h (Gauss–Newton) and p = −H⁻¹∇h:
@@ -102,11 +114,14 @@ def _newton(arm: TrackingArm, gain: float, block: Record) -> None:
     null space; without it the posture overshoots again and again near singularities.
 
     `gain` is a factor of the null-space part; 0 leaves the plain pseudo-inverse. Postures end inside the limits;
-    `largest` is the largest joint motion, rad.
+    `largest` is the largest joint motion, rad. Where the hand `turns` to an orientation that is wanted, h counts the
+    rotation vector to it instead of the difference of directions.
     """
     n, error, J, p, H_inv_J = len(arm.joints), block.error, block.J, block.p, block.H_inv_J
     damping, inverse, v, multipliers, caution = block.damping, block.inverse, block.v, block.multipliers, block.caution
     _linearise(arm, block)
+    if turns:
+        _turn(len(arm.joints), block)
     _improve(n, arm.limit_weight, block)
     for lane in range(LANES):
         squared = error[0, lane] ** 2 + error[1, lane] ** 2 + error[2, lane] ** 2
@@ -117,16 +132,16 @@ def _newton(arm: TrackingArm, gain: float, block: Record) -> None:
             multipliers[0, lane] += J[i, 0, lane] * p[i, lane]
             multipliers[1, lane] += J[i, 1, lane] * p[i, lane]
             multipliers[2, lane] += J[i, 2, lane] * p[i, lane]
-    _invert(block)
+    invert(block)
     for lane in range(LANES):
         x, y, z = multipliers[0, lane], multipliers[1, lane], multipliers[2, lane]
-        multipliers[0, lane], multipliers[1, lane], multipliers[2, lane] = _times(inverse, lane, x, y, z)
+        multipliers[0, lane], multipliers[1, lane], multipliers[2, lane] = times(inverse, lane, x, y, z)
         damping[lane] = arm.damping_floor + arm.damping_per_error * caution[lane]
-    _invert(block)
+    invert(block)
     for lane in range(LANES):
         a, b, c = multipliers[0, lane], multipliers[1, lane], multipliers[2, lane]
         care = gain / (1 + arm.curvature * np.sqrt(a * a + b * b + c * c))
-        x, y, z = _times(inverse, lane, error[0, lane], error[1, lane], error[2, lane])
+        x, y, z = times(inverse, lane, error[0, lane], error[1, lane], error[2, lane])
         v[0, lane], v[1, lane], v[2, lane] = x - care * a, y - care * b, z - care * c
         caution[lane] = care
     for i in range(n):
@@ -163,11 +178,24 @@ def _linearise(arm: TrackingArm, block: Record) -> None:
 
 
 @compiled
-def _times(matrix: Array, lane: int, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Multiply the symmetric matrix of a lane by a vector."""
-    a, b, c = matrix[0, lane], matrix[1, lane], matrix[2, lane]
-    f, g, h = matrix[3, lane], matrix[4, lane], matrix[5, lane]
-    return a * x + h * y + g * z, h * x + b * y + f * z, g * x + f * y + c * z
+def _turn(n: int, block: Record) -> None:
+    """Find the rotation vector from the last joint's orientation to the one that is wanted, and its derivative D."""
+    axes, turn, wanted, direction, D = block.axes, block.turn, block.wanted, block.direction, block.D
+    for lane in range(LANES):
+        x, y, z, alike = 0.0, 0.0, 0.0, -1.0
+        for c in range(3):  # of R and W, the sum of the columns' cross products is 2 sin θ times the axis
+            a, b, d = axes[n - 1, c, 0, lane], axes[n - 1, c, 1, lane], axes[n - 1, c, 2, lane]
+            p, q, r = turn[c, 0, lane], turn[c, 1, lane], turn[c, 2, lane]
+            x, y, z = x + b * r - d * q, y + d * p - a * r, z + a * q - b * p
+            alike += a * p + b * q + d * r  # and that of their products 1 + 2 cos θ
+        sine = np.sqrt(x * x + y * y + z * z)
+        factor = np.arctan2(sine, alike) / sine if sine > 1e-12 else 0.5
+        wanted[0, lane], wanted[1, lane], wanted[2, lane] = factor * x, factor * y, factor * z
+    direction[:] = 0
+    for i in range(n):
+        for c in range(3):
+            for lane in range(LANES):
+                D[i, c, lane] = axes[i, 2, c, lane]
 
 
 @compiled
@@ -191,9 +219,9 @@ def _improve(n: int, limit_weight: float, block: Record) -> None:
             H_inv_J[i, 0, lane] = mobility[i, lane] * D[i, 0, lane]
             H_inv_J[i, 1, lane] = mobility[i, lane] * D[i, 1, lane]
             H_inv_J[i, 2, lane] = mobility[i, lane] * D[i, 2, lane]
-    _product(n, D, H_inv_J, block)
+    product(n, D, H_inv_J, block)
     damping[:] = flexibility
-    _invert(block)
+    invert(block)
     mixed[:] = 0
     for c in range(3):
         for lane in range(LANES):
@@ -201,7 +229,7 @@ def _improve(n: int, limit_weight: float, block: Record) -> None:
     for i in range(n):
         for lane in range(LANES):
             x, y, z = H_inv_J[i, 0, lane], H_inv_J[i, 1, lane], H_inv_J[i, 2, lane]
-            G[i, 0, lane], G[i, 1, lane], G[i, 2, lane] = _times(inverse, lane, x, y, z)
+            G[i, 0, lane], G[i, 1, lane], G[i, 2, lane] = times(inverse, lane, x, y, z)
         for c in range(3):
             for lane in range(LANES):
                 v[c, lane] -= D[i, c, lane] * p[i, lane]
@@ -217,39 +245,7 @@ def _improve(n: int, limit_weight: float, block: Record) -> None:
                 turned = G[i, 0, lane] * mixed[0, c, lane] + G[i, 1, lane] * mixed[1, c, lane]
                 turned += G[i, 2, lane] * mixed[2, c, lane]
                 H_inv_J[i, c, lane] = mobility[i, lane] * J[i, c, lane] - turned
-    _product(n, J, H_inv_J, block)
-
-
-@compiled
-def _product(n: int, A: Array, B: Array, block: Record) -> None:
-    """Find the symmetric matrix AᵀB of arrays (n, 3, LANES)."""
-    matrix = block.matrix
-    matrix[:] = 0
-    for i in range(n):
-        for lane in range(LANES):
-            matrix[0, lane] += A[i, 0, lane] * B[i, 0, lane]
-            matrix[1, lane] += A[i, 1, lane] * B[i, 1, lane]
-            matrix[2, lane] += A[i, 2, lane] * B[i, 2, lane]
-            matrix[3, lane] += A[i, 1, lane] * B[i, 2, lane]
-            matrix[4, lane] += A[i, 0, lane] * B[i, 2, lane]
-            matrix[5, lane] += A[i, 0, lane] * B[i, 1, lane]
-
-
-@compiled
-def _invert(block: Record) -> None:
-    """Find the inverse of `matrix` + `damping`·I by cofactors."""
-    matrix, inverse, damping = block.matrix, block.inverse, block.damping
-    for lane in range(LANES):
-        a, b, c = matrix[0, lane] + damping[lane], matrix[1, lane] + damping[lane], matrix[2, lane] + damping[lane]
-        f, g, h = matrix[3, lane], matrix[4, lane], matrix[5, lane]
-        x, y, z = b * c - f * f, f * g - h * c, h * f - g * b
-        scale = 1 / (a * x + h * y + g * z)
-        inverse[0, lane], inverse[1, lane], inverse[2, lane] = (
-            x * scale,
-            (a * c - g * g) * scale,
-            (a * b - h * h) * scale,
-        )
-        inverse[3, lane], inverse[4, lane], inverse[5, lane] = (g * h - a * f) * scale, z * scale, y * scale
+    product(n, J, H_inv_J, block)
 
 
 @compiled
@@ -293,7 +289,8 @@ def settle(
         arm: the arm.
         postures: B secondary objectives.
         q: (N, n) where to begin, rad.
-        targets: (N, 3) places for the end effector, metres.
+        targets: (N, 3) places for the end effector, metres; or (N, 12), and orientations for the last joint, column by
+            column.
         which: (N,) objective of each.
         num_improving: largest number of steps that improve the posture, too.
         num_final: largest number of steps after them that only correct the place.
@@ -304,17 +301,16 @@ def settle(
     """
     q, memory = q.copy(), np.empty(1, BLOCK)
     block = memory[0]
-    at, target, moves, largest = block.q, block.target, block.moves, block.largest
+    at, moves, largest, turns = block.q, block.moves, block.largest, targets.shape[1] > 3
     for first in range(0, len(q), LANES):
         num = load(block, q, first)
         for lane in range(LANES):
             row = first + min(lane, num - 1)
             _aim(postures, which[row], lane, block)
             moves[lane] = 1
-            for c in range(3):
-                target[c, lane] = targets[row, c]
+            _want(targets[row], targets[row], 0.0, lane, block)
         for step in range(num_improving + num_final):
-            _newton(arm, 1.0 if step < num_improving else 0.0, block)
+            _newton(arm, 1.0 if step < num_improving else 0.0, turns, block)
             num_moving = 0
             for lane in range(LANES):
                 moves[lane] = moves[lane] if largest[lane] > tolerance else 0.0
@@ -335,7 +331,8 @@ def walk(arm: TrackingArm, postures: Postures, lines: Array, lengths: Array, sta
     Args:
         arm: the arm.
         postures: B secondary objectives, one for each line.
-        lines: (B, T + 1, 3) places of the end effector, metres, the first one that of the start.
+        lines: (B, T + 1, 3) places of the end effector, metres, the first one that of the start; or (B, T + 1, 12), as
+            the targets of `settle`.
         lengths: (B, T + 1) distance travelled up to there, metres.
         starts: (B, n) where to begin, rad.
         num_strides: number of strides of equal length along each line.
@@ -347,7 +344,7 @@ def walk(arm: TrackingArm, postures: Postures, lines: Array, lengths: Array, sta
     result, memory = np.empty((num, last, n)), np.empty(1, BLOCK)
     block = memory[0]
     q = np.empty((LANES, num_strides + 1, n))
-    at, target, moves, passed = block.q, block.target, block.moves, np.zeros(LANES, np.int64)
+    at, moves, passed, turns = block.q, block.moves, np.zeros(LANES, np.int64), lines.shape[2] > 3
     for first in range(0, num, LANES):
         here = load(block, starts, first)
         for lane in range(LANES):
@@ -362,10 +359,8 @@ def walk(arm: TrackingArm, postures: Postures, lines: Array, lengths: Array, sta
                         piece += 1
                     passed[lane], begins = piece, lengths[row, piece]
                     part = (travelled - begins) / max(lengths[row, piece + 1] - begins, 1e-300)
-                    for c in range(3):
-                        begin, end = lines[row, piece, c], lines[row, piece + 1, c]
-                        target[c, lane] = begin + part * (end - begin)
-                _newton(arm, 1.0, block)
+                    _want(lines[row, piece], lines[row, piece + 1], part, lane, block)
+                _newton(arm, 1.0, turns, block)
             for lane in range(LANES):
                 for i in range(n):
                     q[lane, stride, i] = at[i, lane]

@@ -14,25 +14,25 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from numbers import Real
-from typing import ClassVar, TypeVar
+from typing import ClassVar
 
 import numpy as np
 
 from dt_viz.errors import FormatError
 from dt_viz.flows.augmented_systems import PhaseCurve, PhasedAttractor, Shear
 from dt_viz.flows.fields import Array, Indices
+from dt_viz.flows.rotations import turned
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem, asinh_exp, log_sinh
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.initial_guess import groups_of
 from dt_viz.learning.interface import AnyImitation, State
 from dt_viz.learning.patterns import AugmentedSettings, Pattern, learn_patterns, patterns_of, set_apart, told_by_starts
+from dt_viz.learning.poses import Poses, latest
 from dt_viz.learning.preparation import ImitationError, Motions, prepare
 from dt_viz.learning.timing import ARRIVED, TimedAttractor
 from dt_viz.metrics import arc_length
-
-_T = TypeVar("_T")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -49,6 +49,10 @@ class AugmentedImitation(AnyImitation):
     """Numbers of the demonstrations, of those that were given, that the starts are of."""
     plain_clock: TimedAttractor
     """Clock of the phase, without the pace that is predicted for a start."""
+    radius: float = 0.0
+    """Length that a turn of the hand by one radian counts, metres."""
+    goal_orientation: Array | None = None
+    """(4,) orientation of the hand at the goal, wxyz; None of motions without orientations."""
 
     @property
     def dim(self) -> int:
@@ -61,21 +65,30 @@ class AugmentedImitation(AnyImitation):
         return tuple(sorted(pattern.label for pattern in self.patterns if pattern.label is not None))
 
     @property
+    def has_orientation(self) -> bool:
+        """Whether the hand's orientation was learned, too."""
+        return self.goal_orientation is not None
+
+    @property
     def num_conditions(self) -> int:
         """Number of coordinates of a condition: those of the start, and the index of the pattern."""
         return self.dim + 1
 
-    @cached_property
-    def system(self) -> DiffeomorphicSystem:
-        """The learned dynamical system, of states (y, s, a)."""
-        base = PhasedAttractor(
+    @property
+    def base(self) -> PhasedAttractor:
+        """The base system of states (y, s, a)."""
+        return PhasedAttractor(
             goal=np.zeros(self.dim + 1 + self.num_conditions),
             speed=self.plain_clock.speed,
             smoothing=self.plain_clock.smoothing,
             predictions=self,
             power=self.augmented.power,
         )
-        return DiffeomorphicSystem(Shear(self), base)
+
+    @cached_property
+    def system(self) -> DiffeomorphicSystem:
+        """The learned dynamical system, of states (y, s, a)."""
+        return DiffeomorphicSystem(Shear(self), self.base)
 
     def system_in(self, origin: Array, axes: Array, scale: float) -> DiffeomorphicSystem:
         return self.placed(origin, axes[:, : self.dim], scale).system
@@ -124,11 +137,16 @@ class AugmentedImitation(AnyImitation):
         """The motion (d,), metres, that is predicted for a condition (c,), over the phase."""
         return self._curves(condition.tobytes())
 
+    @cached_property
+    def poses(self) -> Poses | None:
+        """The motions of the hand's pose; None of motions without orientations."""
+        return None if self.goal_orientation is None else Poses(self, self.goal_orientation)
+
     def sensitivity(self, condition: Array) -> PhaseCurve:
         """Its derivative (d, c) with respect to the condition; that with respect to the pattern is 0."""
-        pattern = self._pattern(condition)
+        pattern = self.pattern(condition)
         slopes = pattern.slopes(condition[: self.dim])
-        return self._over_phase(np.concatenate([slopes, np.zeros_like(slopes[..., :1])], axis=-1))
+        return self.over_phase(np.concatenate([slopes, np.zeros_like(slopes[..., :1])], axis=-1))
 
     def clock(self, condition: Array) -> TimedAttractor:
         """The clock of the phase that is predicted for a condition (c,)."""
@@ -146,6 +164,8 @@ class AugmentedImitation(AnyImitation):
             self,
             starts=origin + scale * self.starts @ axes.T,
             goal=origin + scale * axes @ self.goal,
+            radius=scale * self.radius,
+            goal_orientation=None if self.goal_orientation is None else turned(axes, self.goal_orientation),
             top=scale * self.top,
             patterns=tuple(pattern.placed(origin, axes, scale) for pattern in self.patterns),
             plain_clock=replace(
@@ -155,22 +175,23 @@ class AugmentedImitation(AnyImitation):
 
     @cached_property
     def _curves(self) -> Callable[[bytes], PhaseCurve]:
-        return _kept(lambda condition: self._over_phase(self._pattern(condition).points(condition[: self.dim])))
+        return latest(lambda condition: self.over_phase(self.pattern(condition).points(condition[: self.dim])))
 
     @cached_property
     def _clocks(self) -> Callable[[bytes], TimedAttractor]:
-        return _kept(self._clock)
+        return latest(self._clock)
 
-    def _pattern(self, condition: Array) -> Pattern:
+    def pattern(self, condition: Array) -> Pattern:
+        """The pattern of a condition (c,)."""
         return self.patterns[round(condition[-1])]
 
-    def _over_phase(self, values: Array) -> PhaseCurve:
+    def over_phase(self, values: Array) -> PhaseCurve:
         """Values (K, …) at the knots, from the start, over the phase."""
         return PhaseCurve.through(self.top * np.linspace(0.0, 1.0, len(values)), values[::-1])
 
     def _clock(self, condition: Array) -> TimedAttractor:
-        pattern, start, slowest = self._pattern(condition), condition[: self.dim], self.augmented.min_pace
-        length, usual = (float(arc_length(points)[-1]) for points in (pattern.points(start), pattern.mean))
+        pattern, start, slowest = self.pattern(condition), condition[: self.dim], self.augmented.min_pace
+        length, usual = (float(arc_length(points)[-1]) for points in (pattern.poses(start), pattern.mean_pose))
         length = max(length, self.augmented.min_length * usual)
         duration, *profile = pattern.timing.at(start)
         behind = np.maximum.accumulate(np.clip(pattern.profile + np.array(profile), 0.0, 1.0))
@@ -275,6 +296,8 @@ def _with_patterns(
         pattern_of=of,
         numbers=motions.numbers,
         plain_clock=_plain_clock(top, duration, settings.num_paces),
+        radius=settings.turn_length * motions.extent,
+        goal_orientation=motions.goal_orientation,
     )
 
 
@@ -300,8 +323,3 @@ def _plain_clock(top: float, duration: float, num_knots: int) -> TimedAttractor:
         knots=np.linspace(nearest, farthest, num_knots),
         paces=np.ones((1, num_knots)),
     )
-
-
-def _kept(compute: Callable[[Array], _T]) -> Callable[[bytes], _T]:
-    """A function of a condition's bytes whose latest results are kept."""
-    return lru_cache(64)(lambda content: compute(np.frombuffer(content)))

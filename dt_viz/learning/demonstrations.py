@@ -127,7 +127,7 @@ def check_demonstrations(
             if np.ptp(positions, axis=0).max() < MIN_EXTENT:
                 raise FormatError(f"positions of {name!r}", "a motion that stays at one point", "a motion")
             if orientations is not None:
-                orientations = _checked_orientations(orientations, len(times), name, where)
+                orientations = checked_orientations(orientations, len(times), f"orientations of {name!r}", where)
             times.setflags(write=False)
             positions.setflags(write=False)
             checked.append(Demonstration(times, positions, name, orientations))
@@ -181,9 +181,10 @@ def samples_of(
     return samples
 
 
-def _checked_orientations(orientations: np.ndarray, num: int, name: str, where: Callable[[int], str]) -> np.ndarray:
+def checked_orientations(
+    orientations: np.ndarray, num: int, field: str = "orientations", where: Callable[[int], str] = at_sample
+) -> np.ndarray:
     """Return unit quaternions (T, 4) as a new read-only array; raise FormatError if they are none."""
-    field = f"orientations of {name!r}"
     turns = real_numbers(orientations, field)
     if turns.shape != (num, 4):
         raise FormatError(field, f"an array of shape {turns.shape}", f"quaternions wxyz, ({num}, 4)")

@@ -13,16 +13,17 @@ from typing import Any, Literal
 
 import numpy as np
 from scipy.linalg import solveh_banded
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Slerp
 
 from dt_viz.flows.fields import Array, Indices, Mask
+from dt_viz.flows.rotations import quaternions, rotation
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.metrics import arc_length, interpolate
 from dt_viz.warning import in_millimetres
 
-FindingKind = Literal["units", "outliers", "gap", "jitter", "pause", "still", "elsewhere", "end", "start"]
+FindingKind = Literal["units", "outliers", "gap", "jitter", "pause", "still", "elsewhere", "end", "start", "turn"]
 """Kind of a finding: another unit, single samples far off, a time without samples, trembling, standing still, never
-moving, an end that is not the others' goal, one beside it, and a start at the goal."""
+moving, an end that is not the others' goal, one beside it, a start at the goal, and more than half a turn."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,8 @@ class PreparationSettings:
     """Distance from the goal up to which a start is at the goal."""
     standing_step: float = 1e-3
     """Length of a step, lasting 1 % of the motion, below which the motion stands still."""
+    standing_turn: float = 5e-3
+    """Turn of the hand in 1 % of the motion, rad, below which it does not turn."""
     long_stand: float = 0.1
     """Part of the duration from which standing still is reported."""
     goal: tuple[float, ...] | None = None
@@ -151,12 +154,16 @@ class Repaired:
         if self.times is self._given[0] and self.positions is self._given[1]:
             return self.demonstration
         changes: dict[str, Any] = {"times": self.times, "positions": self.positions}
-        turns = getattr(self.demonstration, "orientations", None)
-        if turns is not None:
-            at = np.interp(self._moments, self._given[0], np.arange(len(turns)))
-            turning = Slerp(np.arange(len(turns)), Rotation.from_quat(np.roll(turns, -1, axis=1)))
-            changes["orientations"] = np.roll(turning(at).as_quat(), 1, axis=1)  # wxyz
+        if self.demonstration.orientations is not None:
+            changes["orientations"] = self.orientations_at(self.times)
         return replace(self.demonstration, **changes)
+
+    def orientations_at(self, times: Array) -> Array:
+        """Orientations (N, 4), wxyz, at times (N,), seconds, of a take that has some."""
+        turns = self.demonstration.orientations
+        assert turns is not None
+        at = np.interp(np.interp(times, self.times, self._moments), self._given[0], np.arange(len(turns)))
+        return quaternions(Slerp(np.arange(len(turns)), rotation(turns))(at))
 
     @property
     def inspection(self) -> Inspection:
@@ -330,6 +337,9 @@ def _pauses(take: Repaired, settings: PreparationSettings) -> list[tuple[float, 
     steps = np.linalg.norm(places[width:] - places[:-width], axis=1) / width
     spread = float(np.sqrt(take.positions.var(axis=0).sum()))
     standing = steps < max(settings.standing_step * spread, settings.noisy_step * take.jitter)
+    if take.demonstration.orientations is not None:
+        turned = rotation(take.orientations_at(even))
+        standing &= (turned[:-width].inv() * turned[width:]).magnitude() / width < settings.standing_turn
     slow = np.convolve(standing, np.ones(width)) > 0
     if slow[1:-1].mean() <= settings.long_stand or slow.all():
         return []

@@ -63,6 +63,11 @@ class AnyImitation(ABC):
         """Different labels, increasing, that a motion may have; none where starts tell what follows."""
         return ()
 
+    @property
+    def has_orientation(self) -> bool:
+        """Whether the hand's orientation was learned, too."""
+        return False
+
     @cached_property
     @abstractmethod
     def system(self) -> DiffeomorphicSystem:

@@ -12,7 +12,7 @@ nothing explained, is among them, and far from the starts g(u) is u.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -21,7 +21,7 @@ from dt_viz.flows.augmented_systems import PhaseCurve
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.learning.initial_guess import groups_of
 from dt_viz.learning.preparation import Motions, PreparationSettings
-from dt_viz.metrics import arc_length, interpolate
+from dt_viz.metrics import arc_length, interpolate, resample_by_arc_length
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,8 @@ class AugmentedSettings:
 
     phase_length: float = 0.5
     """s_max: what the phase counts beside a distance of places."""
+    turn_length: float = 0.5
+    """Length that a turn of the hand by one radian counts beside a distance of places."""
     power: float = 3.0
     """p of the base system: with a large one, what leads off the motion fades early."""
     min_knots: int = 120
@@ -58,9 +60,10 @@ class AugmentedSettings:
     """Number of independent deviations that a demonstration counts for when predictors are weighted: more than its
     coordinates, fewer than its knots, whose deviations are alike."""
     time_noise: float = 1.0
-    """Variance of clocks that the starts do not explain, relative to what they do."""
+    """Variance of clocks and of the hand's turns that the starts do not explain, relative to what they do."""
     time_width: float = 0.1
-    """Width of a kernel of that variance, in spreads, so that a demonstration's own start has its own timing."""
+    """Width of a kernel of that variance, in spreads, so that a demonstration's own start has its own timing and
+    turns."""
     time_jitter: float = 0.02
     """Part of that variance that remains noise."""
     num_paces: int = 80
@@ -133,10 +136,13 @@ class StartProcess:
         return np.tensordot(self._kernel((start - self.mean)[None] / self.spread)[0], self.coefficients, 1)
 
     def slope_at(self, start: Array) -> Array:
-        """The derivative (…, d) of the value with respect to the start (d,); of values without a narrow kernel."""
+        """The derivative (…, d) of the value with respect to the start (d,)."""
         offset = (start - self.mean) / self.spread - self.known
-        weights = -self._kernel((start - self.mean)[None] / self.spread)[0][:, None] * offset
-        return np.moveaxis(np.tensordot(weights, self.coefficients, (0, 0)), 0, -1) / (self.width**2 * self.spread)
+        slopes = [
+            np.tensordot(-alike[0][:, None] * offset, self.coefficients, (0, 0)) / (width**2 * self.spread)
+            for width, alike in self._kernels((start - self.mean)[None] / self.spread)
+        ]
+        return np.moveaxis(np.sum(slopes, axis=0), 0, -1)
 
     def placed(self, origin: Array, axes: Array, scale: float, vectors: Array) -> StartProcess:
         """The same in a space of more dimensions, values multiplied by `vectors` (d, D) from the right.
@@ -153,9 +159,14 @@ class StartProcess:
 
     def _kernel(self, at: Array) -> Array:
         """What is alike of starts `at` (N, d) and the known ones, (N, R)."""
+        return np.sum([alike for _, alike in self._kernels(at)], axis=0)
+
+    def _kernels(self, at: Array) -> Iterator[tuple[float, Array]]:
+        """The parts of this, each with its width."""
         squared = ((at[:, None] - self.known) ** 2).sum(axis=-1)
-        alike = np.exp(-squared / (2 * self.width**2))
-        return alike + self.noise * np.exp(-squared / (2 * self.narrow**2)) if self.narrow else alike
+        yield self.width, np.exp(-squared / (2 * self.width**2))
+        if self.narrow:
+            yield self.narrow, self.noise * np.exp(-squared / (2 * self.narrow**2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,6 +189,11 @@ class Pattern:
     """Mean logarithm of the duration of motions a metre long, seconds."""
     timing: StartProcess
     """(1 + P,) offsets from that logarithm, and from the profile."""
+    turn: Array | None = None
+    """(K, 3) mean rotation vectors of the hand at the goal's orientation, at the knots, in metres by the length that a
+    radian counts; None without orientations."""
+    turning: StartProcess | None = None
+    """(K, 3) offsets from them."""
 
     def points(self, start: Array) -> Array:
         """The predicted motion from a start (d,) at the knots, (K, d), metres."""
@@ -192,6 +208,23 @@ class Pattern:
         eye = np.eye(len(off))
         return self.shapes.slope_at(start) + u * eye + beside * (eye - np.outer(off, off) / self.reach**2)
 
+    def poses(self, start: Array) -> Array:
+        """The predicted motion with rotation vectors, (K, d + 3), metres; places (K, d) without orientations."""
+        points = self.points(start)
+        if self.turn is None or self.turning is None:
+            return points
+        return np.hstack([points, self.turn + self.turning.at(start)])
+
+    def pose_slopes(self, start: Array) -> Array:
+        """The derivative (K, d + 3, d), or (K, d, d), of these with respect to the start (d,)."""
+        slopes = self.slopes(start)
+        return slopes if self.turning is None else np.concatenate([slopes, self.turning.slope_at(start)], axis=1)
+
+    @property
+    def mean_pose(self) -> Array:
+        """(K, d + 3) the mean demonstration with rotation vectors; (K, d) without orientations."""
+        return self.mean if self.turn is None else np.hstack([self.mean, self.turn])
+
     def placed(self, origin: Array, axes: Array, scale: float) -> Pattern:
         """The same in a space of more dimensions; see `dt_viz.learning.augmented.AugmentedImitation.placed`."""
         return replace(
@@ -201,6 +234,8 @@ class Pattern:
             shapes=self.shapes.placed(origin, axes, scale, scale * axes.T),
             duration=self.duration - np.log(scale) / 2,
             timing=self.timing.placed(origin, axes, scale, np.eye(len(self.profile) + 1)),
+            turn=None if self.turn is None else scale * self.turn,
+            turning=None if self.turning is None else self.turning.placed(origin, axes, scale, scale * np.eye(3)),
         )
 
 
@@ -215,33 +250,29 @@ def learn_patterns(
         labels: label of each pattern; None without labels.
         settings: settings of the augmented state.
     """
-    starts, points = motions.starts, _at_knots(motions, settings)
+    starts, poses = motions.starts, motions.poses(settings.turn_length * motions.extent)
+    at_knots = _at_knots(poses, motions.extent, settings)
+    points, turns = np.split(at_knots, [starts.shape[1]], axis=2)
+    turns = turns - (1 - _phases(turns.shape[1])[:, None]) ** 2 * turns[:, -1:]  # the ends are moved to the goal's
     scatter = float(np.sqrt(((starts - starts.mean(axis=0)) ** 2).sum(axis=1).mean()))
     spread = max(scatter, settings.min_spread * motions.extent)
-    profiles = np.stack(
-        [_profile(*each, settings.num_timed) for each in zip(motions.times, motions.positions, strict=True)]
-    )
-    paces = [np.log(t[-1] / np.sqrt(arc_length(path)[-1])) for t, path in zip(motions.times, points, strict=True)]
+    profiles = np.stack([_profile(*each, settings.num_timed) for each in zip(motions.times, poses, strict=True)])
+    paces = [np.log(t[-1] / np.sqrt(arc_length(path)[-1])) for t, path in zip(motions.times, at_knots, strict=True)]
     timing = np.column_stack([paces, profiles])
     patterns = []
     for index in range(int(of.max()) + 1):
         own = of == index
-        usual = timing[own].mean(axis=0)
+        usual, turn = timing[own].mean(axis=0), turns[own].mean(axis=0)
+        own_process = settings.width, settings.time_noise, settings.time_width, settings.time_jitter
         patterns.append(
             Pattern(
                 None if labels is None else labels[index],
                 *_predictor(points[own], spread, settings.knot_error * motions.extent, settings),
                 usual[1:],
                 float(usual[0]),
-                StartProcess.of(
-                    starts[own],
-                    timing[own] - usual,
-                    spread,
-                    settings.width,
-                    settings.time_noise,
-                    settings.time_width,
-                    settings.time_jitter,
-                ),
+                StartProcess.of(starts[own], timing[own] - usual, spread, *own_process),
+                turn if motions.turns else None,
+                StartProcess.of(starts[own], turns[own] - turn, spread, *own_process) if motions.turns else None,
             )
         )
     return tuple(patterns)
@@ -346,16 +377,16 @@ def told_by_starts(starts: Array, of: Indices, least: float) -> bool:
     return bool(own.all() and apart[of[:, None] != of].min(initial=np.inf) >= least)
 
 
-def _at_knots(motions: Motions, settings: AugmentedSettings) -> Array:
-    """Demonstrations at as few knots as they are followed by, (R, K, d)."""
+def _at_knots(poses: Sequence[Array], extent: float, settings: AugmentedSettings) -> Array:
+    """Poses (T_i, d) of demonstrations at as few knots as they are followed by, (R, K, d)."""
     num = settings.min_knots
     while True:
-        points = motions.resampled(5 * num)
+        points = np.stack([resample_by_arc_length(path, 5 * num) for path in poses])
         even, knots = np.linspace(0.0, 1.0, points.shape[1]), np.linspace(0.0, 1.0, num)
         at_knots = np.stack([interpolate(knots, even, path) for path in points])
         between = PhaseCurve.through(knots, at_knots.swapaxes(0, 1)).at(even).swapaxes(0, 1)
         missed = np.linalg.norm(between - points, axis=-1).mean(axis=1).max()
-        if missed <= settings.knot_error * motions.extent or 2 * num > settings.max_knots:
+        if missed <= settings.knot_error * extent or 2 * num > settings.max_knots:
             return at_knots
         num *= 2
 

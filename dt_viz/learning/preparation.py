@@ -10,6 +10,7 @@ import numpy as np
 
 from dt_viz.errors import FormatError
 from dt_viz.flows.fields import Array, Indices
+from dt_viz.flows.rotations import logarithm, mean_orientation
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.demonstrations import Demonstration, samples_of
 from dt_viz.learning.inspection import Inspection, PreparationSettings, Repaired, repair
@@ -46,6 +47,10 @@ class Motions:
     """What was found out about each demonstration, also about those that are left out."""
     repaired: tuple[Demonstration, ...]
     """All demonstrations without outliers, gaps, jitter and pauses; their ends are where they were, but for jitter."""
+    goal_orientation: Array | None = None
+    """(4,) mean orientation of the hand at the ends, wxyz; None of motions without orientations."""
+    turns: tuple[Array, ...] = ()
+    """(T_i, 3) rotation vectors of the hand at that orientation, rad; none without orientations."""
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -86,15 +91,20 @@ class Motions:
         """First points, (R, d)."""
         return np.stack([path[0] for path in self.positions])
 
+    def poses(self, radius: float) -> tuple[Array, ...]:
+        """Places and rotation vectors times a radius, (T_i, d + 3), metres; places (T_i, d) without orientations."""
+        if not self.turns:
+            return self.positions
+        return tuple(np.hstack([path, radius * turn]) for path, turn in zip(self.positions, self.turns, strict=True))
+
     def resampled(self, num: int = 120) -> Array:
         """Resample all motions at `num` points equally spaced along each, (R, num, d)."""
         return np.stack([resample_by_arc_length(path, num) for path in self.positions])
 
     def only(self, which: Indices) -> Motions:
         """Some of these motions, by their places among these."""
-        chosen = {
-            name: tuple(getattr(self, name)[k] for k in which) for name in ("numbers", "names", "times", "positions")
-        }
+        names = ("numbers", "names", "times", "positions", *(("turns",) if self.turns else ()))
+        chosen = {name: tuple(getattr(self, name)[k] for k in which) for name in names}
         return replace(self, **chosen)
 
     def missed_by(self, system: DiffeomorphicSystem, states: Array) -> float:
@@ -145,8 +155,22 @@ def prepare(demonstrations: Sequence[Demonstration], settings: PreparationSettin
         raise ImitationError("every demonstration starts at the goal and stays there; there is nothing to learn")
     names = tuple(take.demonstration.name for take in kept.values())
     times, positions = zip(*((take.times, take.positions) for take in kept.values()), strict=True)
+    orientation, turns = _turns([take for take in takes if take.kept])
     inspections = tuple(take.inspection for take in takes)
-    return Motions(tuple(kept), names, times, positions, goal, spread, inspections, repaired)
+    return Motions(tuple(kept), names, times, positions, goal, spread, inspections, repaired, orientation, turns)
+
+
+def _turns(takes: Sequence[Repaired]) -> tuple[Array | None, tuple[Array, ...]]:
+    """Find the goal's orientation (4,), and rotation vectors (T_i, 3) of the takes; none unless all have some."""
+    if len(takes[0].positions[0]) < 3 or any(take.demonstration.orientations is None for take in takes):
+        return None, ()
+    orientations = [take.orientations_at(take.times) for take in takes]
+    goal = mean_orientation(np.stack([turned[-1] for turned in orientations]))
+    turns = tuple(logarithm(goal, turned) for turned in orientations)
+    for take, turn in zip(takes, turns, strict=True):
+        if (farthest := np.linalg.norm(turn, axis=1).max()) > np.pi:
+            take.find("turn", f"turns by {np.rad2deg(farthest):.0f}° away from the orientation at the goal")
+    return goal, turns
 
 
 def _spread(takes: Sequence[Repaired]) -> float:
@@ -229,7 +253,7 @@ def _lead_to_goal(take: Repaired, goal: Array, near: float) -> None:
         first = away[0]
         text = "starts at the goal, where a stable motion ends"
         take.find("start", text, f"its first {take.times[first]:.2g} s are left out")
-        take.times, take.positions = take.times[first:] - take.times[first], path[first:]
+        take.replace(take.times[first:], path[first:], take.times[first:])
 
 
 def _end_moved(path: Array, goal: Array) -> Array:

@@ -90,6 +90,8 @@ def learn(
         return given(settings, progress)
     if state == "augmented" or labels is not None:
         return fit_augmented(demonstrations, labels, augmented)
+    if has_orientations(demonstrations):
+        return fit_augmented(demonstrations, None, augmented, "the hand's orientation is learned, too")
     choice, augmented = choice or ChoiceSettings(), augmented or AugmentedSettings()
     motions, found, begun = prepare(demonstrations, settings.preparation), None, 0.0
     if len(motions.numbers) >= choice.fewest:
@@ -104,6 +106,11 @@ def learn(
             return replace(plain(settings), choice=found)
     progress(1.0, "done")
     return replace(fit_augmented(demonstrations, None, augmented, reason), choice=found)
+
+
+def has_orientations(demonstrations: Sequence[Demonstration]) -> bool:
+    """Whether demonstrations have what a motion of the hand's orientation is learned from: in space, all of them."""
+    return all(one.orientations is not None and one.dimension == 3 for one in demonstrations)
 
 
 def leaving_out(

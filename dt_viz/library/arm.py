@@ -14,13 +14,14 @@ from numpy.typing import ArrayLike
 from dt_viz.control.controller import ArmController
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.flows.fields import Array
+from dt_viz.flows.rotations import apart
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.library.motion import NUM_COORDINATES, Motion
 from dt_viz.library.motion import Path as HandPath
 from dt_viz.motion.following import Follower
 from dt_viz.motion.solve import Solved, solve
 from dt_viz.motion.stack import FINE, LIVE, build_stack
-from dt_viz.robot.inverse_kinematics import inverse_kinematics, track
+from dt_viz.robot.inverse_kinematics import best_start, inverse_kinematics, track
 from dt_viz.robot.models import EndEffector, robot_from_urdf
 from dt_viz.robot.models import load_arm as load_robot
 from dt_viz.robot.placement import place
@@ -42,11 +43,14 @@ class JointPath:
     """(T,) seconds, later than the path's where the joints' velocity limits ask for it."""
     error: Array
     """(T,) distances of the hand from the path, metres: what it misses, or gives way by."""
+    turned: Array | None = None
+    """(T,) angles of the hand from the path's orientations, degrees; None where it has none."""
 
     def __repr__(self) -> str:
         off = in_millimetres(float(self.error.max()))
         samples = f"{len(self.q)} samples of {self.q.shape[1]} joints, {self.times[-1]:.3g} s"
-        return f"JointPath({samples}, hand up to {off} beside its path)"
+        turned = "" if self.turned is None else f" and {self.turned.max():.1f}° beside its orientation"
+        return f"JointPath({samples}, hand up to {off} beside its path{turned})"
 
 
 class BlockedError(Exception):
@@ -143,7 +147,7 @@ class Arm:
         return f"Arm({self.robot.title}: {self.robot.num_joints} joints, reach {self.robot.reach:.2f} m)"
 
     def follow(self, path: HandPath) -> JointPath:
-        """The joints along a path of the hand.
+        """The joints along a path of the hand, and its orientations where it has them.
 
         Args:
             path: in space, in the frame of the arm's base.
@@ -154,10 +158,18 @@ class Arm:
         """
         if path.positions.shape[1] != NUM_COORDINATES:
             raise ValueError(f"the arm follows paths in space, with 3 coordinates, not {path.positions.shape[1]}")
-        start = inverse_kinematics(self.robot, path.positions[0])
-        tracked = track(self.robot, path.positions, start)
+        wanted = path.orientations
+        if wanted is None:
+            start = inverse_kinematics(self.robot, path.positions[0])
+        else:
+            start = best_start(self.robot, path.positions, wanted)
+        tracked = track(self.robot, path.positions, start, orientations=wanted)
         times = within_velocity_limits(path.times, tracked.q, self.robot.velocity_limits)
-        return JointPath(tracked.q, times, tracked.error)
+        return JointPath(tracked.q, times, tracked.error, self._turned(tracked.q, wanted))
+
+    def _turned(self, q: Array, orientations: Array | None) -> Array | None:
+        """Angles (T,), degrees, of the hand at postures (T, n) from orientations (T, 4)."""
+        return None if orientations is None else np.rad2deg(apart(self.robot.hand_orientation(q), orientations))
 
     def rollouts(self, motion: Motion, *, spacing: float = 0.005) -> tuple[JointPath, ...]:
         """Motions of the whole arm from the demonstrations' starts, around what the motion tells it to avoid.
@@ -189,10 +201,14 @@ class Arm:
         due = solved.stack.rays.times(arm.index, arm.fraction)
         away = self.robot.end_effector(arm.p) - solved.stack.positions_at(arm.index, arm.fraction)
         rows = [arm.index == rollout for rollout in range(len(nominal.starts))]
+        turned = self._turned(arm.p, nominal.orientations_at(arm.index, arm.fraction))
         limits = self.robot.velocity_limits
         return tuple(
             JointPath(
-                arm.p[row], within_velocity_limits(due[row], arm.p[row], limits), np.linalg.norm(away[row], axis=1)
+                arm.p[row],
+                within_velocity_limits(due[row], arm.p[row], limits),
+                np.linalg.norm(away[row], axis=1),
+                None if turned is None else turned[row],
             )
             for row in rows
         )

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 from dt_viz.errors import FormatError
 from dt_viz.flows.fields import Array
 from dt_viz.library.motion import NUM_COORDINATES, Motion
+from dt_viz.library.orientations import angular_velocity
 
 PUSHED = 0.05
 """Distance from where the hand should be, relative to half the demonstrations' extent, from which it was pushed."""
@@ -48,6 +49,17 @@ class HandController:
         """Part of the motion that is left, from 1 to 0; 0 in the plain state, which has none."""
         return float(self._rest[0]) / self._top if self._top else 0.0
 
+    def turn(self, orientation: ArrayLike, dt: float) -> Array:
+        """ω (3,), rad/s, in the base frame, for `dt` seconds, of a hand with an orientation (4,), wxyz.
+
+        It is that of the motion at the phase which the next `step` begins from; what turned the hand aside dies away.
+
+        Raises:
+            FormatError: the orientation is none, the period is not above 0, or no orientations were learned.
+        """
+        _check_period(dt)
+        return angular_velocity(self._motion.nominal.learned.poses, self._rest, orientation, dt)
+
     def step(self, position: ArrayLike, dt: float) -> Array:
         """ẏ (d,), m/s, that takes a hand at `position` (d,), metres, to where the motion is `dt` seconds later.
 
@@ -56,8 +68,7 @@ class HandController:
         Raises:
             FormatError: the position is not d finite numbers, or the period is not above 0.
         """
-        if not 0 < dt < np.inf:
-            raise FormatError("dt", f"{dt:g}", "seconds, above 0")
+        _check_period(dt)
         motion, solution = self._motion, self._motion.solution
         place = motion.in_space(motion.checked(np.asarray(position, float)[None], "position"))[0]
         state = np.concatenate([place, self._rest])
@@ -66,3 +77,8 @@ class HandController:
         reached = solution.system.rollout(state, np.array([dt]))[0]
         self._expected, self._rest = reached[:NUM_COORDINATES], reached[NUM_COORDINATES:]
         return (self._expected - place)[: motion.dimension] / dt
+
+
+def _check_period(dt: float) -> None:
+    if not 0 < dt < np.inf:
+        raise FormatError("dt", f"{dt:g}", "seconds, above 0")

@@ -31,9 +31,10 @@ from dt_viz.learning.inspection import Inspection
 from dt_viz.learning.patterns import AugmentedSettings
 from dt_viz.learning.preparation import DemonstrationWarning, prepare
 from dt_viz.learning.state import State, learn
+from dt_viz.library.orientations import along
 from dt_viz.library.places import as_place, in_space
-from dt_viz.library.report import many, missed, sampled, summaries
-from dt_viz.library.takes import Demonstrations, demonstrations_of
+from dt_viz.library.report import many, missed, orientation_line, sampled, summaries
+from dt_viz.library.takes import Demonstrations, check_goals, demonstrations_of
 from dt_viz.motion.certificates import Certificates, DrawnSamples, certified
 from dt_viz.motion.diagnostics import motion_warnings
 from dt_viz.motion.nominal import NUM_SAMPLES, Learned, Nominal
@@ -56,6 +57,8 @@ class Path:
     """(T, d), metres."""
     times: Array
     """(T,) seconds from the start."""
+    orientations: Array | None = None
+    """(T, 4) orientations of the hand, unit quaternions wxyz; None where none were learned."""
 
     def __repr__(self) -> str:
         return f"Path({sampled(self.positions, self.times)})"
@@ -79,7 +82,8 @@ class Motion:
         where = "the plane" if self.dimension == 2 else "space"
         layers = "".join(f", {layer.name}" for layer in self._layers)
         goal = in_metres(self._learned.goal[: self.dimension])
-        return f"Motion({takes} in {where}, {self.state} state, goal {goal}{layers})"
+        turns = " with orientation" if self.has_orientation else ""
+        return f"Motion({takes} in {where}{turns}, {self.state} state, goal {goal}{layers})"
 
     def report(self) -> str:
         """What was learned from which takes: a line for each with what was found, what was done, and the error.
@@ -91,6 +95,8 @@ class Motion:
             lines.append(f"{self.state} state: {self.reason}")
         elif learned.imitation.choice:
             lines.append(f"{self.state} state: {learned.imitation.choice}")
+        if text := orientation_line(learned.imitation, learned.task.demonstrations):
+            lines.append(text)
         paths = [path[:, : self.dimension] for path in learned.demonstrated.paths]
         for inspection, own, path in zip(self.inspections, learned.task.demonstrations, paths, strict=False):
             off = f"; the learned motion is up to {missed(path, own.positions)} off" if inspection.kept else ""
@@ -127,7 +133,12 @@ class Motion:
         return Motion(self._learned, scenario.stack, self.inspections)
 
     def rollouts(
-        self, starts: ArrayLike | None = None, *, spacing: float = 0.005, label: float | None = None
+        self,
+        starts: ArrayLike | None = None,
+        *,
+        spacing: float = 0.005,
+        label: float | None = None,
+        orientations: ArrayLike | None = None,
     ) -> tuple[Path, ...]:
         """Exact paths to the goal, sampled more closely where the stack stretches them.
 
@@ -136,10 +147,12 @@ class Motion:
             spacing: largest distance between neighbouring samples, metres.
             label: of the motions from `starts`, None takes that of the nearest demonstrated start; without starts only
                 the demonstrations with this label are followed, None follows all.
+            orientations: (R, 4) of the hand in which they begin, or (4,) for all, quaternions wxyz; what is beside the
+                learned orientation fades. None begins with that.
 
         Raises:
-            FormatError: no demonstration has such a label, starts are not (R, d) finite numbers, or the spacing is not
-                above 0.
+            FormatError: no demonstration has such a label, starts are not (R, d) finite numbers, the spacing is not
+                above 0, or orientations are given that are none, or none were learned.
         """
         if not spacing > 0:
             raise FormatError("spacing", f"{spacing:g}", "metres, above 0")
@@ -153,7 +166,8 @@ class Motion:
         evaluate = lambda index, fraction: system.transform.inverse(rays.at(index, fraction))[:, None, :3]  # noqa: E731
         bundle = refined(evenly_sampled(evaluate, len(rays.z0), NUM_SAMPLES), evaluate, spacing)
         times = bundle.split(rays.times(bundle.index, bundle.fraction))
-        return tuple(Path(path[:, : self.dimension], t) for path, t in zip(bundle.paths, times, strict=True))
+        parts = zip(bundle.paths, times, along(self._learned.poses, rays, bundle, orientations), strict=True)
+        return tuple(Path(path[:, : self.dimension], t, turned) for path, t, turned in parts)
 
     def velocity(
         self, y: ArrayLike, phase: float | None = None, start: ArrayLike | None = None, label: float | None = None
@@ -208,6 +222,11 @@ class Motion:
     def reason(self) -> str:
         """Why it was learned in the augmented state, if nobody asked for it."""
         return self._learned.imitation.reason
+
+    @property
+    def has_orientation(self) -> bool:
+        """Whether the hand's orientation was learned, too."""
+        return self._learned.imitation.has_orientation
 
     @property
     def labels(self) -> tuple[float, ...]:
@@ -348,8 +367,9 @@ def fit(
         objective: what is fitted in the plain state: the motions, or their velocities as in eq. (3).
         state: "plain" is the paper's: one vector field of places, which needs no memory. "augmented" remembers its
             phase and where it began: it crosses itself, comes back, winds, and draws the figure from other starts,
-            too. "auto" is plain where a fit with the default settings misses no demonstration by more than 5 % of their
-            extent and, with three or more, follows those that are left out about as well as the augmented state.
+            too, and learns the hand's orientation where all takes have it. "auto" is that then; else plain where a fit
+            with the default settings misses no demonstration by more than 5 % of their extent and, with three or more,
+            follows those that are left out about as well as the augmented state.
         labels: a number for each demonstration, where they differ although they begin at one place: those with one
             number are of one pattern; makes the state augmented. None finds them where that is so; see `Motion.labels`.
         settings: of the plain fit, the objective included, and of the preparation; None takes the defaults.
@@ -369,22 +389,9 @@ def fit(
         settings = replace(settings, preparation=replace(settings.preparation, goal=place))
         augmented = replace(augmented, preparation=replace(augmented.preparation, goal=place))
     motions = prepare(given, settings.preparation)
-    _check_goals(motions.inspections, labels)
+    check_goals(motions.inspections, labels)
     for text in summaries(motions.inspections):
         warnings.warn(text, DemonstrationWarning, stacklevel=2)
     imitation = learn(motions.repaired, settings, state, labels, augmented=augmented)
     learned = Learned.of(Task(demonstrations=motions.repaired), imitation, imitates=True)
     return Motion(learned, inspections=motions.inspections)
-
-
-def _check_goals(inspections: Sequence[Inspection], labels: Sequence[float] | None) -> None:
-    """Raise FormatError where all takes with a label were left out: it has a goal of its own."""
-    if labels is None or len(labels) != len(inspections):
-        return
-    kept = dict.fromkeys(labels, False)
-    for inspection, label in zip(inspections, labels, strict=True):
-        kept[label] |= inspection.kept
-    if not all(kept.values()):
-        lost = next(label for label in kept if not kept[label])
-        accepted = "labels of motions to one goal; learn the takes to each goal by themselves, with goal=… if need be"
-        raise FormatError("labels", f"{lost!r} for takes that end elsewhere than the others", accepted)

@@ -6,7 +6,9 @@ from collections import defaultdict
 from collections.abc import Sequence
 
 from dt_viz.flows.fields import Array
+from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.inspection import Inspection
+from dt_viz.learning.interface import AnyImitation
 from dt_viz.metrics import arc_length, discrete_frechet, resample_by_arc_length
 from dt_viz.warning import in_millimetres
 
@@ -29,6 +31,15 @@ def summaries(inspections: Sequence[Inspection]) -> list[str]:
             alike[found.kind, found.remedy].append(text)
     more = "{} (and {} alike; see Motion.report())"
     return [more.format(first, many(len(rest), "more take")) if rest else first for first, *rest in alike.values()]
+
+
+def orientation_line(imitation: AnyImitation, demonstrations: Sequence[Demonstration]) -> str:
+    """What became of the orientations of demonstrations; empty where these have none."""
+    without = [one.name for one in demonstrations if one.orientations is None]
+    if imitation.has_orientation or len(without) == len(demonstrations):
+        return ""
+    why = "in the plain state" if imitation.state == "plain" else "of motions in the plane"
+    return f"the hand's orientation is not learned {why if not without else f': {without[0]!r} has none'}"
 
 
 def missed(path: Array, demonstration: Array) -> str:

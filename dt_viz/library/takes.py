@@ -21,9 +21,11 @@ from dt_viz.learning.demonstrations import (
     MAX_DURATION,
     Demonstration,
     DemonstrationError,
+    checked_orientations,
     load_demonstrations,
     samples_of,
 )
+from dt_viz.learning.inspection import Inspection
 from dt_viz.learning.preparation import DemonstrationWarning
 from dt_viz.scenario.tasks import TASKS
 
@@ -70,7 +72,7 @@ def demonstrations_of(given: Any, rate: float | None = None) -> tuple[Demonstrat
             warnings.warn(text, DemonstrationWarning, stacklevel=3)
         named = [_complete(take, number) for number, take in enumerate(takes, 1)]
         pairs = zip(named, samples_of(named), strict=True)
-        checked = tuple(replace(take, times=times, positions=positions) for take, (times, positions) in pairs)
+        checked = tuple(_checked(take, *samples) for take, samples in pairs)
         farthest = np.array([np.abs(take.positions).max() for take in checked])
         if np.median(farthest) > MAX_COORDINATE or farthest.max() > 1e3 * MAX_COORDINATE:
             found = f"{farthest.max():.6g} m in {checked[int(farthest.argmax())].name!r}"
@@ -87,6 +89,13 @@ def _complete(take: Demonstration, number: int) -> Demonstration:
     """A take with times and a name."""
     times = np.linspace(0.0, DURATION, len(take.positions)) if take.times is UNTIMED else take.times
     return replace(take, times=times, name=take.name or f"take {number}")
+
+
+def _checked(take: Demonstration, times: Array, positions: Array) -> Demonstration:
+    """A take with its samples, and orientations that are unit quaternions."""
+    turns = take.orientations
+    turns = None if turns is None else checked_orientations(turns, len(times), f"orientations of {take.name!r}")
+    return replace(take, times=times, positions=positions, orientations=turns)
 
 
 def _takes(given: Any, rate: float | None) -> Iterator[Demonstration]:  # noqa: ANN401 - whatever was given
@@ -178,3 +187,16 @@ def _of_table(table: Any, rate: float | None) -> Iterator[Demonstration]:  # noq
     for label in dict.fromkeys(labels.tolist()):
         rows = labels == label
         yield Demonstration(_times(int(rows.sum()), rate) if times is None else times[rows], positions[rows], label)
+
+
+def check_goals(inspections: Sequence[Inspection], labels: Sequence[float] | None) -> None:
+    """Raise FormatError where all takes with a label were left out: it has a goal of its own."""
+    if labels is None or len(labels) != len(inspections):
+        return
+    kept = dict.fromkeys(labels, False)
+    for inspection, label in zip(inspections, labels, strict=True):
+        kept[label] |= inspection.kept
+    if not all(kept.values()):
+        lost = next(label for label in kept if not kept[label])
+        accepted = "labels of motions to one goal; learn the takes to each goal by themselves, with goal=… if need be"
+        raise FormatError("labels", f"{lost!r} for takes that end elsewhere than the others", accepted)

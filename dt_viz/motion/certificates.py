@@ -16,8 +16,10 @@ import numpy as np
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Diffeomorphism
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.rollouts import ARRIVED
+from dt_viz.flows.rotations import apart
 from dt_viz.motion.stack import Solution
 from dt_viz.robot.collision import CollisionReport
+from dt_viz.robot.robot import Robot
 from dt_viz.warning import Kind, MotionWarning, in_millimetres, told
 
 NUM_CHECKED, NUM_POSTURES = 400, 100
@@ -41,6 +43,23 @@ MAX_ROUND_TRIP = 1e-6
 
 
 @dataclass(frozen=True)
+class HandTurn:
+    """Angles, degrees, between an arm's hand and the orientations that its motion has."""
+
+    median: float
+    largest: float
+
+    @classmethod
+    def of(cls, robot: Robot, q: Array, orientations: Array) -> HandTurn:
+        """Compute them at postures q (T, n), rad, from orientations (T, 4), wxyz."""
+        off = np.rad2deg(apart(robot.hand_orientation(q), orientations))
+        return cls(float(np.median(off)), float(off.max()))
+
+    def __str__(self) -> str:
+        return f"hand turned {self.median:.1f}° beside its orientation in the median, {self.largest:.1f}° at most"
+
+
+@dataclass(frozen=True)
 class Certificates:
     """Checks of a motion, and the warnings that follow; None is what has not been computed."""
 
@@ -57,6 +76,8 @@ class Certificates:
     """Largest ‖ψ⁻¹(ψ(y)) − y‖ along the rollouts, metres."""
     lyapunov_falls: bool | None = None
     """Whether Φ(ψ(y(t))) falls strictly along every rollout."""
+    turn: HandTurn | None = None
+    """How far the hand of the arm is turned from the orientations of the motion that it shows; None without any."""
     found: tuple[MotionWarning, ...] = ()
     """All warnings, also those that only follow from others."""
 
@@ -70,6 +91,8 @@ class Certificates:
             parts.append(f"round trip within {1e3 * self.round_trip_error:.1g} mm")
         if self.lyapunov_falls is not None:
             parts.append(f"Lyapunov value {'falls' if self.lyapunov_falls else 'does not fall'}")
+        if self.turn is not None:
+            parts.append(f"{self.turn}")
         texts = "; ".join(warning.text for warning in self.warnings)
         return f"Certificates({', '.join(parts)}, {f'warnings: {texts}' if texts else 'no warnings'})"
 

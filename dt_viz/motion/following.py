@@ -14,12 +14,20 @@ from dt_viz.avoidance.passing import Posture
 from dt_viz.avoidance.postures import ReferencePostures, reference_postures
 from dt_viz.avoidance.start_status import StartStatus, start_warnings
 from dt_viz.flows.fields import Array, Indices, Mask
+from dt_viz.flows.rotations import mean_orientation
 from dt_viz.memo import Memo
 from dt_viz.metrics import arc_length
 from dt_viz.motion.nominal import Learned, Nominal, NominalTrajectory
 from dt_viz.motion.stack import Solution
 from dt_viz.obstacles.union import Union
-from dt_viz.robot.inverse_kinematics import TrackedPath, UnreachableError, drawn_onto, inverse_kinematics, track
+from dt_viz.robot.inverse_kinematics import (
+    TrackedPath,
+    UnreachableError,
+    best_start,
+    drawn_onto,
+    inverse_kinematics,
+    track,
+)
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.scenario import MAX_STARTS
 from dt_viz.scenario.tasks import Task
@@ -29,6 +37,8 @@ BY_FRACTION = 0.3
 """Part of the even spacing of postures that goes by the fraction of the base ray, not by the length of the path."""
 MAX_TRACKING_ERROR = 1e-3
 """Distance by which the hand may miss its path before it is said, metres."""
+MAX_TURNED = 10.0
+"""Angle by which the hand may be turned beside its orientation before it is said, degrees."""
 NUM_ARM_SAMPLES = 200
 """Samples of the motion that the arm shows where it follows a path of the end effector."""
 NUM_ON_PATH = 20
@@ -49,6 +59,8 @@ class ArmMotion:
     """(T, n) joint angles at these times, rad; continuous joints unwrapped."""
     without: Array
     """(T, n) the same at the same moments of the motion without avoidance."""
+    orientations: Array | None = None
+    """(T, 4) orientations that the hand is to have there, wxyz; None where none were learned."""
 
 
 @dataclass(frozen=True)
@@ -98,9 +110,10 @@ class Follower:
         """The joints along a rollout from an added start; one that is dragged leaves nothing behind."""
 
         def lifted() -> Lift:
-            path, fraction = trajectory.positions, trajectory.fraction
+            path, fraction, turns = trajectory.positions, trajectory.fraction, trajectory.orientations
             keep = np.linspace(0, len(fraction) - 1, NUM_CONFIGURATIONS).round().astype(int)
-            return lift(self.robot, fraction[None, keep], path[None, keep], reference)
+            wanted = None if turns is None else turns[None, keep]
+            return lift(self.robot, fraction[None, keep], path[None, keep], reference, orientations=wanted)
 
         return self._memo("added", (trajectory, reference.tobytes()), lifted, newest=NEWEST)
 
@@ -132,30 +145,34 @@ class Follower:
             place = (1 - BY_FRACTION) * length / length[-1] + BY_FRACTION * fractions
             drawn.append([np.interp(samples, place, values) for values in (fractions, *path.T)])
         fraction, paths = np.array(drawn)[:, 0], np.moveaxis(np.array(drawn)[:, 1:], 1, 2)
+        index = np.repeat(np.arange(len(fraction)), NUM_CONFIGURATIONS)
         if exact:
-            index = np.repeat(np.arange(len(fraction)), NUM_CONFIGURATIONS)
             paths = solution.positions_at(index, fraction.ravel()).reshape(paths.shape)
+        wanted = nominal.orientations_at(index, fraction.ravel())
+        wanted = None if wanted is None else wanted.reshape(*paths.shape[:2], 4)
         paths[~nominal.moving] = nominal.goal  # what has no motion makes no difference to how the others are followed
         reference = self.reference(nominal)
         initial = None if exact else self.undisturbed(nominal).tracked.q  # near enough to begin from
-        lifted = lift(self.robot, fraction, paths, reference, initial)
+        lifted = lift(self.robot, fraction, paths, reference, initial, wanted)
         lifted = replace(lifted, moving=nominal.moving, shaping=nominal.shaping)
         if not exact:
             return lifted
 
         def exactly(q: Array, index: Indices, fraction: Array) -> Array:
-            return drawn_onto(self.robot, q, solution.positions_at(index, fraction), reference)
+            wanted = nominal.orientations_at(index, fraction)
+            return drawn_onto(self.robot, q, solution.positions_at(index, fraction), reference, wanted)
 
         return replace(lifted, exactly=exactly)
 
-    def along(self, nominal: Nominal, path: Array) -> TrackedPath:
+    def along(self, nominal: Nominal, path: Array, orientations: Array | None = None) -> TrackedPath:
         """The joints along one path (T, 3) of the end effector, metres.
 
         Args:
             nominal: the motion whose posture the arm stays near to.
             path: where the end effector goes.
+            orientations: (T, 4) of it there, wxyz; None wants none.
         """
-        return track(self.robot, path, self.reference(nominal))
+        return track(self.robot, path, self.reference(nominal), orientations=orientations)
 
     def admission(
         self, nominal: Nominal, avoidance: ArmAvoidance, posture: Posture | None = None, *, keeps: bool = False
@@ -257,7 +274,7 @@ class Follower:
         return self._shared(
             "reference_postures",
             (self.robot, learned),
-            lambda: reference_postures(self.robot, usual, learned.task.starts, _mean(paths)),
+            lambda: reference_postures(self.robot, usual, learned.task.starts, _mean(paths), _turns(learned)),
         )
 
     def out_of_reach(self, nominal: Nominal) -> Mask:
@@ -276,6 +293,9 @@ class Follower:
             because = ", a joint is at its limit" if joints.limits_hit.any() else ""
             text = f"the arm misses the path of rollout {place + 1} by up to {1e3 * worst:.0f} mm{because}"
             warnings.append(MotionWarning(Kind.PATH_MISSED, text, ARM))
+        if (turned := float(np.rad2deg(joints.turned.max()))) > MAX_TURNED:
+            text = f"the arm turns the hand up to {turned:.0f}° beside the orientation of rollout {place + 1}"
+            warnings.append(MotionWarning(Kind.HAND_TURNED, text, ARM))
         if joints.damped.any():
             text = "the arm is stretched out or folded on the way: its pseudo-inverse is damped there"
             warnings.append(MotionWarning(Kind.DAMPED, text, ARM))
@@ -287,19 +307,36 @@ class Follower:
         def lifted() -> Lift | UnreachableError:
             starts, bundle = learned.task.starts, learned.demonstrated.bundle
             try:
-                reference = (
-                    inverse_kinematics(self.robot, starts.mean(axis=0)) if posture is None else np.array(posture)
-                )
+                reference = np.array(posture) if posture is not None else self._usual(learned)
             except UnreachableError as error:
                 return error
             stride = np.linspace(0, len(bundle.index) // len(starts) - 1, NUM_CONFIGURATIONS).round().astype(int)
             fractions = bundle.fraction.reshape(len(starts), -1)[:, stride]
-            return lift(self.robot, fractions, bundle.positions.reshape(len(starts), -1, 3)[:, stride], reference)
+            paths, turns = bundle.positions.reshape(len(starts), -1, 3)[:, stride], learned.demonstrated.orientations
+            wanted = None if turns is None else np.stack(turns)[:, stride]
+            return lift(self.robot, fractions, paths, reference, orientations=wanted)
 
         found = self._shared("demonstrated", (self.robot, learned, posture), lifted, newest=NUM_POSTURES)
         if isinstance(found, UnreachableError):
             raise found
         return found
+
+    def _usual(self, learned: Learned) -> Array:
+        """The usual posture (n,), rad, of the hand at the mean start. Raises UnreachableError."""
+        turns, starts = _turns(learned), learned.task.starts
+        if turns is None:
+            return inverse_kinematics(self.robot, starts.mean(axis=0))
+        return best_start(self.robot, _mean(learned.demonstrated.paths), turns[len(starts) :])
+
+
+def _turns(learned: Learned) -> Array | None:
+    """Orientations (R + `NUM_ON_PATH`, 4) of the hand at the starts and along the mean motion; None without any."""
+    turns = learned.demonstrated.orientations
+    if turns is None:
+        return None
+    kept = np.linspace(0, len(turns[0]) - 1, NUM_ON_PATH).round().astype(int)
+    mean = [mean_orientation(np.stack([turn[k] for turn in turns])) for k in kept]
+    return np.concatenate([[turn[0] for turn in turns], mean])
 
 
 def _mean(paths: Sequence[Array]) -> Array:

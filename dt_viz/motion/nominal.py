@@ -11,10 +11,11 @@ import numpy as np
 from dt_viz.avoidance.passing import Posture
 from dt_viz.avoidance.start_status import StartStatus, start_warnings
 from dt_viz.flows.diffeomorphisms import Identity
-from dt_viz.flows.fields import Array, Mask
+from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.flows.rollouts import Bundle, Rays, evenly_sampled
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.interface import AnyImitation
+from dt_viz.learning.poses import Poses
 from dt_viz.scenario.scenario import Start
 from dt_viz.scenario.tasks import Task
 from dt_viz.warning import MotionWarning
@@ -35,6 +36,8 @@ class NominalTrajectory:
     """(n,) where on its base ray the samples are."""
     positions: Array
     """(n, 3) samples, metres."""
+    orientations: Array | None = None
+    """(n, 4) orientations of the hand there, wxyz; None where none were learned."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +75,12 @@ class Learned:
         """Places (N, 3), metres, of base states (N, k): the first coordinates of ψ⁻¹."""
         return self.system.transform.inverse(base_states)[:, :3]
 
+    @cached_property
+    def poses(self) -> Poses | None:
+        """The motions of the hand's pose, in the world; None of motions without orientations."""
+        predictions = getattr(self.system.base, "predictions", None)
+        return getattr(predictions, "poses", None)
+
     @property
     def labels(self) -> tuple[float, ...]:
         """The labels that a start may have."""
@@ -97,7 +106,10 @@ class Learned:
         images = self.system.transform.forward(states)
         rays = Rays(images, self.system.base)
         bundle = evenly_sampled(lambda i, u: self.places(rays.at(i, u))[:, None], len(states), num_samples)
-        parts = states[:, :3], images, bundle.split(bundle.fraction), bundle.paths
+        turns: Sequence[Array | None] = [None] * len(states)
+        if self.poses is not None:
+            turns = bundle.split(self.poses.predicted(rays.at(bundle.index, bundle.fraction)[:, 3:]))
+        parts = states[:, :3], images, bundle.split(bundle.fraction), bundle.paths, turns
         return tuple(NominalTrajectory(*part) for part in zip(*parts, strict=True))
 
 
@@ -210,6 +222,12 @@ class Nominal:
         return Bundle(index, np.concatenate(fractions), np.concatenate(positions)[:, None])
 
     @cached_property
+    def orientations(self) -> tuple[Array, ...] | None:
+        """Orientations of the hand along each rollout, (T_i, 4), wxyz; None where none were learned."""
+        turns = tuple(each.orientations for each in self.trajectories if each.orientations is not None)
+        return turns or None
+
+    @cached_property
     def paths(self) -> tuple[Array, ...]:
         """Positions of each rollout, (T_i, 3), metres."""
         return tuple(trajectory.positions for trajectory in self.trajectories)
@@ -218,6 +236,14 @@ class Nominal:
     def ends(self) -> Array:
         """(R + 1, 3) starts and goal, metres."""
         return np.concatenate([self.starts, [self.goal]])
+
+    def orientations_at(self, index: Indices, fraction: Array) -> Array | None:
+        """Orientations (N, 4) of the hand, wxyz, of rollouts (N,) at fractions (N,) of their rays.
+
+        What is stacked moves places and leaves them as they are. None of motions without orientations.
+        """
+        poses = self.learned.poses
+        return None if poses is None else poses.predicted(self.rays.at(index, fraction)[:, 3:])
 
     def rays_between(self, ends: Array) -> Rays:
         """Rays of motions that begin and end elsewhere: `ends` (R + 1, 3), metres; see `ends`."""

@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-FORMAT = 3
+FORMAT = 5
 """Version of what is found of an arm and of its file; raised with every change, so that older files are not used."""
 MAX_BYTES = 500 * 10**6
 """Largest number of bytes that a file unpacks to."""
 SMALL = ("joint_names", "lower", "upper", "velocity_limits", "joint_rotations", "joint_translations", "hand_axis",
-         "end_effector_offset", "home", "levers", "base")  # fmt: skip
+         "hand_rotation", "end_effector_offset", "home", "levers", "base")  # fmt: skip
 """Fields of an arm that are arrays, and are stored as they are."""
 
 

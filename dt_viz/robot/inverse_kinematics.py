@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dt_viz.flows.rotations import apart, rotation
 from dt_viz.kernels.tracking import Postures, settle, walk
 from dt_viz.robot.robot import Robot
 
@@ -36,6 +37,7 @@ class TrackedPath:
         manipulability: (*B, T) sqrt det(J Jᵀ), m³.
         damped: (*B, T) whether the manipulability is that of a singularity: the pseudo-inverse is no longer the exact
             Moore-Penrose one there, which would move the joints fast for little motion of the hand.
+        turned: (*B, T) angle of the hand from the orientation that is wanted, rad; 0 where none is.
     """
 
     q: Array
@@ -43,12 +45,17 @@ class TrackedPath:
     limits_hit: NDArray[np.bool_]
     manipulability: Array
     damped: NDArray[np.bool_]
+    turned: Array
 
 
 def inverse_kinematics(
-    robot: Robot, target: ArrayLike, seed: ArrayLike | None = None, hand_direction: ArrayLike | None = None
+    robot: Robot,
+    target: ArrayLike,
+    seed: ArrayLike | None = None,
+    hand_direction: ArrayLike | None = None,
+    orientation: ArrayLike | None = None,
 ) -> Array:
-    """Find a natural configuration inside the joint limits with the end effector at the target.
+    """Find a natural configuration inside the joint limits with the end effector at the target: the best of `arriving`.
 
     Damped Gauss-Newton steps run from many starts at once: the seed, the ready pose turned towards the target, and
     random ones around both (always the same). Among those that arrive, the one with the best posture wins: near the
@@ -61,12 +68,27 @@ def inverse_kinematics(
         seed: (n,) rad, posture to stay near; by default the ready pose turned towards the target.
         hand_direction: (3,) desired direction of the hand, base frame, any length; weighed against the rest of the
             posture. By default the seed's direction, or without a seed outwards and `hand_pitch` below horizontal.
+        orientation: (4,) desired orientation of the hand, wxyz, in place of its direction; as near as the place allows.
 
     Returns:
         (n,) joint angles, rad; continuous joints within π of the seed.
 
     Raises:
         UnreachableError: No start arrived. The message says by how much the best one missed.
+    """
+    return arriving(robot, target, seed, hand_direction, orientation)[0]
+
+
+def arriving(
+    robot: Robot,
+    target: ArrayLike,
+    seed: ArrayLike | None = None,
+    hand_direction: ArrayLike | None = None,
+    orientation: ArrayLike | None = None,
+) -> Array:
+    """Find all configurations (K, n), rad, to which the starts of `inverse_kinematics` lead, the best first.
+
+    Arguments and errors are those of that.
     """
     settings, target = robot.sized_tracking, np.asarray(target, dtype=float)
     ahead, left = np.array(robot.front), np.array([-robot.front[1], robot.front[0], 0.0])
@@ -84,18 +106,23 @@ def inverse_kinematics(
     weight = settings.direction_weight
     if hand_direction is not None:
         direction, weight = np.asarray(hand_direction, dtype=float), settings.asked_direction_weight
+    if orientation is not None:
+        weight = settings.first_orientation_weight
+    wanted = _targets(robot, target, orientation)
     direction = direction / np.linalg.norm(direction)
 
     scatter = np.random.default_rng(0).normal(scale=0.8, size=(settings.num_restarts, robot.num_joints))
     scatter[:2] = 0.0
     starts = np.where(np.arange(len(scatter))[:, None] % 2 == 0, reference, ready) + scatter
     posture = _posture(robot, reference[None], direction[None], weight)
-    targets, which, q = np.tile(target, (len(starts), 1)), np.zeros(len(starts), int), robot.clip(starts)
+    targets, which, q = np.tile(wanted, (len(starts), 1)), np.zeros(len(starts), int), robot.clip(starts)
     for iteration in range(settings.max_iterations):  # all go on until each has come to rest
         improves = iteration < settings.max_iterations - settings.final_sweeps
         before, q = q, settle(robot.tracking_arm, posture, q, targets, which, int(improves), int(not improves), -1.0)
         if np.abs(q - before).max() < 1e-6:
             break
+    if orientation is not None:
+        q = _turned_to(robot, q, targets, which, posture, settings.turning_sweeps)
 
     q -= 2 * np.pi * np.where(np.isinf(robot.upper), np.round((q - reference) / (2 * np.pi)), 0.0)
     chain = robot.chain(q.T)
@@ -108,9 +135,30 @@ def inverse_kinematics(
         )
     excess = q - np.clip(q, posture.soft_lower, posture.soft_upper)
     cost = ((q - reference) ** 2 + settings.limit_weight * excess**2).sum(axis=1) / 2  # h(q) of `track`
-    cost += weight / 2 * ((chain.direction - direction[:, None]) ** 2).sum(axis=0)
+    if orientation is None:
+        cost += weight / 2 * ((chain.direction - direction[:, None]) ** 2).sum(axis=0)
+    else:
+        cost += settings.orientation_weight / 2 * _turned(robot, q, np.broadcast_to(orientation, (len(q), 4))) ** 2
     cost += settings.floor_weight * np.maximum(0.0, -chain.origins[:, 2]).sum(axis=0)
-    return q[np.argmin(np.where(miss <= settings.tolerance, cost, np.inf))]
+    cost[miss > settings.tolerance] = np.inf
+    return q[np.argsort(cost, kind="stable")[: np.isfinite(cost).sum()]]
+
+
+def best_start(robot: Robot, path: Array, orientations: Array) -> Array:
+    """Find the posture (n,), rad, from which an arm follows a path (T, 3) with orientations (T, 4) of the hand best.
+
+    Where the wrist turns far, its joints reach their limits from one branch and not from another.
+
+    Raises:
+        UnreachableError: as `inverse_kinematics`, of the first place.
+    """
+    starts = arriving(robot, path[0], orientation=orientations[0])
+    paths, wanted = (np.broadcast_to(each, (len(starts), *each.shape)) for each in (path, orientations))
+    tracked = track(robot, paths, starts, orientations=wanted)
+    missed = (
+        np.maximum(tracked.error.max(axis=1) - robot.sized_tracking.tolerance, 0) / robot.sized_tracking.turn_length
+    )
+    return starts[np.argmin(missed + tracked.turned.max(axis=1))]
 
 
 def track(
@@ -119,6 +167,7 @@ def track(
     start: ArrayLike,
     initial: ArrayLike | None = None,
     reference: ArrayLike | None = None,
+    orientations: ArrayLike | None = None,
 ) -> TrackedPath:
     """Follow end-effector paths with the joints.
 
@@ -137,6 +186,9 @@ def track(
     on each other, all of them step at once. A cold start first walks along the path in strides, one step each, to stay
     on one branch; this also bridges jumps between samples.
 
+    Where the hand is to have orientations, h counts the square of the angle θ from them in place of the direction, by
+    `orientation_weight`: ½·w_o·θ². The place comes first, so that an arm of five joints turns as far as it can.
+
     Waypoints out of reach get the nearest reachable position inside the limits; see `error`.
 
     Args:
@@ -146,20 +198,23 @@ def track(
         initial: (*B, T, n) tracked joints of a nearby path, rad, from the same start: a warm start for live
             dragging. If its joints jump, a cold start follows.
         reference: (*B, n) or (n,) configuration q_ref that the posture is measured from, rad; by default the start.
+        orientations: (*B, T, 4) of the hand at the waypoints, wxyz; None wants none.
 
     Returns:
         The joint path with its error and the interference of limits and singularities.
 
     Raises:
-        ValueError: `start`, `initial` or `reference` do not fit the shape of `path`.
+        ValueError: `start`, `initial`, `reference` or `orientations` do not fit the shape of `path`.
     """
     path, start = np.asarray(path, dtype=float), np.asarray(start, dtype=float)
     if path.shape[-1] != 3 or start.shape != (*path.shape[:-2], robot.num_joints):
         raise ValueError(f"path must be (*B, T, 3) and start (*B, n), got {path.shape} and {start.shape}")
     shape = (*path.shape[:-1], robot.num_joints)
-    paths, starts = path.reshape(-1, *path.shape[-2:]), robot.clip(start.reshape(-1, robot.num_joints))
+    targets, starts = _targets(robot, path, orientations), robot.clip(start.reshape(-1, robot.num_joints))
+    paths = targets.reshape(-1, *targets.shape[-2:])
     references = starts if reference is None else _references(robot, reference, start.shape)
-    posture = _posture(robot, references, robot.hand_direction(references), at_reference=True)
+    settings, turns = robot.sized_tracking, orientations is not None
+    posture = _near(robot, references, settings.first_orientation_weight if turns else None)
     strides, each = [robot.sized_tracking.stride, robot.sized_tracking.stride / 4], np.arange(len(paths))
     if initial is None:
         guess = _walk(robot, paths, starts, posture, strides.pop(0))
@@ -174,10 +229,13 @@ def track(
             break
         part = Postures(*(field[lost] for field in posture))
         q[lost] = _swept(robot, _walk(robot, paths[lost], starts[lost], part, stride), paths[lost], posture, lost)
-    return _report(robot, q.reshape(shape), path)
+    if turns:
+        q, every = q.reshape(-1, robot.num_joints), np.repeat(each, path.shape[-2])
+        q = _turned_to(robot, q, paths.reshape(-1, 12).copy(), every, posture, settings.turning_sweeps)
+    return _report(robot, q.reshape(shape), path, orientations)
 
 
-def drawn_onto(robot: Robot, q: Array, positions: Array, reference: Array) -> Array:
+def drawn_onto(robot: Robot, q: Array, positions: Array, reference: Array, orientations: Array | None = None) -> Array:
     """Correct postures by small motions so that the end effector is at given positions.
 
     Args:
@@ -185,15 +243,54 @@ def drawn_onto(robot: Robot, q: Array, positions: Array, reference: Array) -> Ar
         q: (N, n) postures a few millimetres off, rad.
         positions: (N, 3) desired positions of the end effector, metres.
         reference: (n,) as in `track`, rad.
+        orientations: (N, 4) as in `track`, wxyz.
 
     Returns:
         (N, n) rad, inside the limits; for a position out of reach a posture near it.
     """
-    posture = _posture(robot, reference[None], robot.hand_direction(reference)[None], at_reference=True)
-    begin, targets = np.array(q, order="C"), np.array(positions, order="C")
-    return settle(
-        robot.tracking_arm, posture, begin, targets, np.zeros(len(q), int), 0, robot.sized_tracking.final_sweeps, -1.0
-    )
+    settings, turns = robot.sized_tracking, orientations is not None
+    posture = _near(robot, reference[None], settings.first_orientation_weight if turns else None)
+    begin, targets = np.array(q, order="C"), np.array(_targets(robot, positions, orientations), order="C")
+    which = np.zeros(len(q), int)
+    if turns:
+        return _turned_to(robot, begin, targets, which, posture, settings.final_sweeps)
+    return settle(robot.tracking_arm, posture, begin, targets, which, 0, settings.final_sweeps, -1.0)
+
+
+def _turned_to(
+    robot: Robot, q: Array, targets: Array, which: NDArray[np.intp], posture: Postures, sweeps: int
+) -> Array:
+    """Turn hands to orientations, as far as their places allow; q (N, n) nearly so, with a lower weight, in `posture`.
+
+    The whole weight makes positions converge slowly near singularities, so that these are corrected with the lower one.
+    """
+    settings, arm = robot.sized_tracking, robot.tracking_arm
+    firm = posture._replace(direction_weight=np.full_like(posture.direction_weight, settings.orientation_weight))
+    q = settle(arm, firm, q, targets, which, sweeps, 0, settings.step_tolerance)
+    return settle(arm, posture, q, targets, which, 0, sweeps, -1.0)
+
+
+def _targets(robot: Robot, positions: Array, orientations: ArrayLike | None) -> Array:
+    """Places (*B, 3) of the end effector; or with orientations (*B, 4) of it those of the last joint, too, (*B, 12)."""
+    if orientations is None:
+        return positions
+    wanted = np.asarray(orientations, dtype=float)
+    if wanted.shape != (*positions.shape[:-1], 4):
+        raise ValueError(f"orientations must be (*B, T, 4) like the path, got {wanted.shape}")
+    columns = robot.hand_rotation @ rotation(wanted.reshape(-1, 4)).as_matrix().transpose(0, 2, 1)
+    return np.concatenate([positions, columns.reshape(*positions.shape[:-1], 9)], axis=-1)
+
+
+def _turned(robot: Robot, q: Array, orientations: Array) -> Array:
+    """Compute angles (N,), rad, of the hand at postures (N, n) from orientations (N, 4)."""
+    return apart(robot.hand_orientation(q), orientations)
+
+
+def _along(robot: Robot, targets: Array) -> Array:
+    """Targets (*B, 3 or 12) whose distances are lengths along a path: a turn by an angle θ moves columns by √2·θ."""
+    turns = np.full(targets.shape[-1], robot.sized_tracking.turn_length / np.sqrt(2))
+    turns[:3] = 1.0
+    return targets if targets.shape[-1] == 3 else turns * targets
 
 
 def _references(robot: Robot, reference: ArrayLike, shape: tuple[int, ...]) -> Array:
@@ -205,30 +302,42 @@ def _references(robot: Robot, reference: ArrayLike, shape: tuple[int, ...]) -> A
 
 
 def _walk(robot: Robot, paths: Array, starts: Array, posture: Postures, stride: float) -> Array:
-    """Walk along paths (B, T, 3), all at once, one stride after the other; return rough joints (B, T, n)."""
-    lines = np.concatenate([robot.end_effector(starts)[:, None], paths], axis=1)
-    lengths = np.cumsum(np.linalg.norm(np.diff(lines, axis=1), axis=-1), axis=1)
+    """Walk along targets (B, T, 3 or 12), all at once, one stride after the other; return rough joints (B, T, n)."""
+    begin = robot.end_effector(starts)
+    if paths.shape[-1] > 3:
+        begin = _targets(robot, begin, robot.hand_orientation(starts))
+    lines = np.concatenate([begin[:, None], paths], axis=1)
+    lengths = np.cumsum(np.linalg.norm(np.diff(_along(robot, lines), axis=1), axis=-1), axis=1)
     num_strides = 1 + int(lengths.max() / stride)
     return walk(robot.tracking_arm, posture, lines, np.insert(lengths, 0, 0.0, axis=1), np.array(starts), num_strides)
 
 
 def _swept(robot: Robot, q: Array, paths: Array, posture: Postures, which: NDArray[np.intp]) -> Array:
-    """Step all waypoints until none moves; q (B, T, n), paths (B, T, 3), `which` (B,) of the postures they have."""
+    """Step all waypoints until none moves; q (B, T, n), targets (B, T, …), `which` (B,) of the postures they have."""
     each, settings = np.repeat(which, paths.shape[1]), robot.sized_tracking
-    begin, targets = np.array(q.reshape(-1, robot.num_joints), order="C"), np.array(paths.reshape(-1, 3), order="C")
-    limits = settings.max_sweeps, settings.final_sweeps, settings.step_tolerance
+    begin, targets = (
+        np.array(q.reshape(-1, robot.num_joints), order="C"),
+        np.array(paths.reshape(-1, paths.shape[-1]), order="C"),
+    )
+    improving = settings.max_sweeps if paths.shape[-1] == 3 else settings.turning_sweeps
+    limits = improving, settings.final_sweeps, settings.step_tolerance
     return settle(robot.tracking_arm, posture, begin, targets, each, *limits).reshape(q.shape)
 
 
-def _report(robot: Robot, q: Array, path: Array) -> TrackedPath:
+def _report(robot: Robot, q: Array, path: Array, orientations: ArrayLike | None) -> TrackedPath:
     chain = robot.chain(q.reshape(-1, robot.num_joints).T)
     manipulability = chain.manipulability().reshape(path.shape[:-1])
+    turned = np.zeros(path.shape[:-1])
+    if orientations is not None:
+        wanted = np.asarray(orientations, dtype=float).reshape(-1, 4)
+        turned = _turned(robot, q.reshape(-1, robot.num_joints), wanted).reshape(turned.shape)
     return TrackedPath(
         q=q,
         error=np.linalg.norm(chain.position.T.reshape(path.shape) - path, axis=-1),
         limits_hit=np.any((q <= robot.lower) | (q >= robot.upper), axis=-1),
         manipulability=manipulability,
         damped=manipulability < robot.sized_tracking.singular_manipulability,
+        turned=turned,
     )
 
 
@@ -237,6 +346,11 @@ def soft_limits(robot: Robot, reference: Array, *, at_reference: bool = True) ->
     margin = robot.sized_tracking.limit_margin
     lower, upper = np.broadcast_arrays(robot.lower + margin, robot.upper - margin, reference)[:2]
     return (np.minimum(lower, reference), np.maximum(upper, reference)) if at_reference else (lower, upper)
+
+
+def _near(robot: Robot, references: Array, weight: float | None) -> Postures:
+    """Make the posture of references (B, n) along paths; None is the usual weight of the hand's direction."""
+    return _posture(robot, references, robot.hand_direction(references), weight, at_reference=True)
 
 
 def _posture(
@@ -250,7 +364,7 @@ def _posture(
 
 
 def loses_branch(robot: Robot, q: Array, paths: Array) -> NDArray[np.bool_]:
-    """Find which (B,) joints (B, T, n) jump by more than a continuous solution along paths (B, T, 3) can."""
-    moved = np.linalg.norm(np.diff(paths, axis=1), axis=-1)
+    """Find which (B,) joints (B, T, n) jump by more than a continuous solution along targets (B, T, …) can."""
+    moved = np.linalg.norm(np.diff(_along(robot, paths), axis=1), axis=-1)
     allowed = 0.05 + robot.sized_tracking.jump_per_root_metre * np.sqrt(moved)  # the constant is for repeated samples
     return np.any(np.abs(np.diff(q, axis=1)) > allowed[..., None], axis=(1, 2))

@@ -63,6 +63,9 @@ class Kinematics:
     """(3,) position of the end effector in the last joint, metres."""
     hand_axis: Array
     """(3,) direction of the hand in the last joint, of any length but 0."""
+    hand_rotation: Array
+    """(3, 3) orientation of the hand in the last joint: that of the end effector's frame, its axes renamed where z is
+    not the one along the hand."""
 
     @property
     def num_joints(self) -> int:
@@ -133,6 +136,11 @@ class Kinematics:
         """Compute unit vectors (*B, 3), base frame, along the hand; q (*B, n), rad."""
         q = np.asarray(q, dtype=float)
         return self.chain(q.reshape(-1, q.shape[-1]).T).direction.T.reshape(*q.shape[:-1], 3)
+
+    def hand_orientation(self, q: ArrayLike) -> Array:
+        """Compute orientations (*B, 4) of the hand, whose z axis is along it, wxyz, base frame; q (*B, n), rad."""
+        rotations = self.forward_kinematics(q)[0][..., -1, :, :] @ self.hand_rotation
+        return _quaternions(rotations.reshape(-1, 3, 3)).reshape(*rotations.shape[:-2], 4)
 
     def jacobian(self, q: ArrayLike) -> Array:
         """Compute the linear Jacobian of the end effector in the base frame.

@@ -142,6 +142,7 @@ def read_shapes(text: str, chain: ArmChain) -> Shapes:
     hand = model.frames[model.getFrameId(chain.tool, pin.FrameType.BODY)].placement
     offset = _turned(hand.translation + hand.rotation @ chain.offset, turns[-1])
     far = float(np.linalg.norm(offset)) > SHORTEST_HAND
+    axis = offset if far else _turned(hand.rotation[:, 2], turns[-1])
     kinematics = Kinematics(
         constant(
             [
@@ -151,7 +152,8 @@ def read_shapes(text: str, chain: ArmChain) -> Shapes:
         ),
         constant([_turned(place.translation, first) for place, first in zip(places, before, strict=False)]),
         constant(offset),
-        constant(offset if far else _turned(hand.rotation[:, 2], turns[-1])),
+        constant(axis),
+        constant(_with_z_along(_turned(hand.rotation.T, turns[-1]).T, axis)),
     )
     solids: dict[str, LinkMesh] = {}
     for name, shape in _geometry(model, text, pin.GeometryType.COLLISION):
@@ -190,6 +192,18 @@ def _to_axis(axis: Array) -> Array:
     if np.abs(axis)[k] == 1.0 and axis[k] > 0:
         return np.roll(np.eye(3), k - 2, axis=1).T.copy()
     return Rotation.align_vectors(axis[None], [[0.0, 0.0, 1.0]])[0].as_matrix()
+
+
+def _with_z_along(frame: Array, axis: Array) -> Array:
+    """Turn a frame (3, 3) by right angles so that, of its axes, z is the one nearest to a direction (3,)."""
+    along = frame.T @ axis
+    nearest = int(np.abs(along).argmax())
+    side, turn = float(np.sign(along[nearest])), np.eye(3)
+    if nearest == 2:
+        turn[1, 1] = turn[2, 2] = side
+    else:
+        turn[:, 2], turn[:, nearest] = side * turn[:, nearest], -side * turn[:, 2]
+    return frame @ turn
 
 
 def _turned(vectors: Array, turn: Array) -> Array:

@@ -20,6 +20,15 @@ class TrackingSettings:
     stops being unique and tracked joints jump between wrist postures."""
     asked_direction_weight: float = 40.0
     """Weight w_d where inverse kinematics is given a direction: it chooses one posture and need not be continuous."""
+    orientation_weight: float = 1000.0
+    """Weight w_o of the hand's orientation (rad), where one is wanted, against joint angles (rad). Its place comes
+    first."""
+    first_orientation_weight: float = 30.0
+    """That weight until postures have settled: with the whole of it they find their branch of the wrist less often."""
+    turning_sweeps: int = 30
+    """Largest number of sweeps that improve the posture where orientations are wanted."""
+    turn_length: float = scales(0.2)
+    """Length that a turn of the hand by one radian counts along a path, metres."""
     limit_weight: float = 50.0
     """Weight of the springs before the joint limits, against 1 for staying near the reference."""
     limit_margin: float = 0.15

@@ -13,6 +13,7 @@ from dt_viz.motion.certificates import (
     NUM_POSTURES,
     Certificates,
     DrawnSamples,
+    HandTurn,
     certified,
     certified_map,
 )
@@ -76,7 +77,9 @@ def with_meshes(frame: Frame, robot: Robot) -> Certificates:
     report = model.report(frame.arm.q, scenario.obstacle)
     # what gives way only in part may still be in the obstacle
     apart = {Kind.ARM_ENTERS} if scenario.warp < 1 else set()
-    known = replace(known, collision=report).warning(*(w for w in report.warnings if w.kind not in apart))
+    wanted = frame.arm.orientations
+    turn = None if wanted is None else HandTurn.of(robot, frame.arm.q, wanted)
+    known = replace(known, collision=report, turn=turn).warning(*(w for w in report.warnings if w.kind not in apart))
     if motion.arm is None or avoidance is None:
         return known
     places = np.flatnonzero(motion.nominal.shaping).tolist()

@@ -53,15 +53,18 @@ def arm_along(frame: Frame, rollout: int, follower: Follower) -> tuple[ArmMotion
     """
     motion, drawn = frame.motion, frame.drawn
     nominal, rows = motion.nominal, np.flatnonzero(drawn.index == rollout)
+    avoids = motion.arm is not None and motion.lifted is not None
+    rows = rows if avoids else rows[arm_samples(len(rows))]
+    wanted = nominal.orientations_at(drawn.index[rows], drawn.fraction[rows])
     if motion.arm is not None and motion.lifted is not None:
         joints, q = motion.lifted.along(rollout), motion.arm.p[rows]
     else:
-        rows = rows[arm_samples(len(rows))]
-        joints = follower.along(nominal, drawn.positions[rows])
+        joints = follower.along(nominal, drawn.positions[rows], wanted)
         q = joints.q
     warnings = follower.warnings(joints, rollout)
     without = follower.undisturbed(nominal).at(drawn.index[rows], drawn.fraction[rows])
-    return ArmMotion(within_velocity_limits(drawn.times[rows], q, follower.robot.velocity_limits), q, without), warnings
+    times = within_velocity_limits(drawn.times[rows], q, follower.robot.velocity_limits)
+    return ArmMotion(times, q, without, wanted), warnings
 
 
 def rest(frame: Frame) -> Array:

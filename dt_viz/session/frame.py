@@ -13,6 +13,8 @@ from dt_viz.avoidance.passing import Passing
 from dt_viz.baselines.base import Method
 from dt_viz.flows.diffeomorphisms import Flow
 from dt_viz.flows.fields import Array, Mask
+from dt_viz.flows.rotations import rotation
+from dt_viz.metrics import arc_length
 from dt_viz.motion.certificates import Certificates, DrawnSamples
 from dt_viz.motion.following import ArmMotion
 from dt_viz.motion.profiles import Profiles
@@ -172,6 +174,25 @@ class Frame:
     def remembers(self) -> bool:
         """Whether the imitation is augmented: it remembers its phase and where it began."""
         return self.motion.nominal.imitation.state == "augmented"
+
+    @property
+    def has_orientation(self) -> bool:
+        """Whether the hand's orientation was learned, too."""
+        return self.motion.nominal.learned.poses is not None
+
+    def hand_frames(self, num: int) -> tuple[Array, Array] | None:
+        """Places (num, 3), metres, evenly along the rollout that the arm follows, and orientations (num, 3, 3) there.
+
+        None where none were learned, or there is no such rollout.
+        """
+        rows = np.flatnonzero(self.drawn.index == self.chosen) if self.chosen is not None else np.zeros(0, int)
+        if not self.has_orientation or not len(rows):
+            return None
+        length = arc_length(self.drawn.positions[rows])
+        kept = rows[np.searchsorted(length, np.linspace(0, length[-1], num)).clip(0, len(rows) - 1)]
+        turned = self.motion.nominal.orientations_at(self.drawn.index[kept], self.drawn.fraction[kept])
+        assert turned is not None
+        return self.drawn.positions[kept], rotation(turned).as_matrix()
 
     @property
     def reason(self) -> str:

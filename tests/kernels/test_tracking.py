@@ -3,6 +3,7 @@
 import numpy as np
 import plain_tracking
 import pytest
+from scipy.spatial.transform import Rotation
 
 from dt_viz.kernels.blocks import LANES
 from dt_viz.kernels.tracking import Postures, settle, walk
@@ -33,6 +34,18 @@ def test_a_step_is_that_of_array_operations(num, gain):
     stepped = settle(ARM, objectives, q, targets, np.arange(num), gain, 1 - gain, -1.0)
     assert np.abs(stepped - q).max(axis=1).min() > 1e-3
     np.testing.assert_allclose(stepped, expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("gain", [0, 1])
+@pytest.mark.parametrize("num", [1, LANES + 3])
+def test_a_step_that_turns_the_hand_is_that_of_array_operations(num, gain):
+    objectives, q, places = postures(num, seed=4)
+    turns = Rotation.random(num, random_state=5)
+    targets = np.hstack([places, turns.as_matrix().transpose(0, 2, 1).reshape(num, 9)])
+    expected = plain_tracking.newton(ROBOT, q, places, objectives, gain, turns)
+    stepped = settle(ARM, objectives, q, targets, np.arange(num), gain, 1 - gain, -1.0)
+    np.testing.assert_allclose(stepped, expected, rtol=0, atol=1e-10)
+    assert np.abs(stepped - settle(ARM, objectives, q, places, np.arange(num), gain, 1 - gain, -1.0)).max() > 1e-3
 
 
 def test_postures_settle_one_by_one():

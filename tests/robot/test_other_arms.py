@@ -14,6 +14,7 @@ from scenes import avoiding
 
 import dt_viz as dt
 from dt_viz.control.controller import ArmController, Phase
+from dt_viz.flows.rotations import rotation
 from dt_viz.memo import Memo
 from dt_viz.motion.stack import FINE
 from dt_viz.obstacles.shapes import Sphere, as_point
@@ -52,6 +53,8 @@ class TestKinematics:
             np.testing.assert_allclose(origins[-1], data.oMi[arm.num_joints].translation, atol=1e-12)
             axis = data.oMi[arm.num_joints].rotation @ arm.hand_axis
             np.testing.assert_allclose(arm.hand_direction(q), axis / np.linalg.norm(axis), atol=1e-12)
+            turned = data.oMi[arm.num_joints].rotation @ arm.hand_rotation
+            np.testing.assert_allclose(rotation(arm.hand_orientation(q)).as_matrix(), turned, atol=1e-12)
 
     def test_where_their_joints_are_at_zero_they_stand_as_the_jaco(self, robot):
         q = random_configurations(robot, 1, (20,))

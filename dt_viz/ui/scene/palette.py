@@ -28,6 +28,8 @@ class Theme:
     """End of the trail that the hand leaves."""
     stale: Colour = (158, 163, 171)
     """Rollouts of an earlier scenario."""
+    axes: tuple[Colour, ...] = ((200, 72, 72), (78, 150, 86), (72, 104, 196))
+    """Axes x, y and z of the hand along a motion."""
     goal: Colour = (0, 158, 115)
     obstacle: Colour = (204, 121, 167)
     bias: Colour = (230, 159, 0)

@@ -17,6 +17,11 @@ from dt_viz.ui.scene.picture import Lines, Look, Picture, add_ball, add_label
 from dt_viz.ui.scene.style import STYLES
 from dt_viz.ui.scene.tubes import Tubes, middles_of
 
+NUM_HANDS = 7
+"""Number of frames along a motion that show the hand's orientation."""
+HAND_AXIS = 0.045
+"""Length of their axes, metres."""
+
 
 class _OutsideTubes(Picture):
     """Lines where they are not inside the tube of a rollout; while a drag goes on they follow with the field."""
@@ -67,6 +72,12 @@ class Rollouts(Picture):
         self.followed = Tubes(scene, "/rollouts/followed", STYLES.followed)
         self.others = Tubes(scene, "/rollouts/others", STYLES.rollout)
         self.added = Tubes(scene, "/rollouts/added", STYLES.added)
+        self._axes = [Lines(scene, f"/rollouts/hand/{axis}", STYLES.hand_axis, k) for k, axis in enumerate("xyz")]
+        self._hide_axes()
+
+    def _hide_axes(self) -> None:
+        for axis in self._axes:
+            axis.node.visible = False
 
     def draw(self, frame: Frame, look: Look) -> None:
         middles, theme = look.tubes.middles, look.theme
@@ -76,6 +87,14 @@ class Rollouts(Picture):
         # thinner beside those of a level
         self.others.show(middles[~added & ~followed], theme, scale=1.0 if frame.level is None else 0.7)
         self.added.show(middles[added & ~followed], theme)
+        frames = None if look.blocked or frame.level is not None else frame.hand_frames(NUM_HANDS)
+        if frames is None:
+            self._hide_axes()
+            return
+        places, turned = frames
+        for k, axis in enumerate(self._axes):
+            axis.show_segments(np.stack([places, places + HAND_AXIS * turned[:, :, k]], axis=1), theme)
+            axis.node.visible = True
 
 
 class LevelRollouts(Picture):

@@ -76,6 +76,7 @@ class Styles:
     ink: LineStyle = LineStyle("ink", 0.005)
     compared_followed: LineStyle = LineStyle("compared", 0.0055)
     compared: LineStyle = LineStyle("compared", 0.0014)
+    hand_axis: LineStyle = LineStyle("axes", 0.0022)
     streamline: LineStyle = LineStyle("streamline", 0.0015)
     grid: LineStyle = LineStyle("grid", 0.0011)
     grid_beside: LineStyle = LineStyle("grid_beside", 0.0007)

@@ -41,6 +41,7 @@ ROWS: Mapping[str, str] = {
     "Arm to obstacle": "Smallest distance of the arm’s surface from the obstacles, and which part of the arm it is.",
     "Arm to itself": "Smallest distance between two parts of the arm that are not neighbours.",
     "Arm to table": "Smallest height of the moving parts of the arm above the table.",
+    "Hand turned": "Angle of the arm’s hand from the orientations of the motion: the median along it, and the largest.",
     "Flow time t": "How long the flow of the avoidance runs: the longer, the more the motions give way.",
     "Strength": "How long the flow of each bias point runs: the longer, the more the motions are pulled to it.",
     "Smallest det J": "Volume that the transforms leave of a piece of space where they squeeze it most. Above 0, space "
@@ -130,6 +131,9 @@ def _rows(frame: Frame, pace: Pace, view: View) -> Iterator[tuple[str, str]]:
     yield "Clearance", off if frame.blocked else clearance_text(known.clearance, whole_arm=whole_arm)
     if shows_arm(view):
         yield from collision_rows(known.collision, unknown)
+        if frame.has_orientation:
+            turn = known.turn
+            yield "Hand turned", unknown if turn is None else f"{turn.median:.1f}°, at most {turn.largest:.0f}°"
     yield from _duration_rows(frame, off)
     yield "Smallest det J", unknown if known.min_det_jacobian is None else f"{known.min_det_jacobian:.2g}"
     yield "Round trip", unknown if known.round_trip_error is None else error_text(known.round_trip_error)

@@ -1,0 +1,204 @@
+"""The hand's orientation, learned with its place: one stable system, whatever signs quaternions have."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from turning import GOAL, turning_takes
+
+import dt_viz as dt
+from dt_viz.flows.rotations import apart, exponential, logarithm, mean_orientation, nearest, quaternions, rotation
+from dt_viz.learning.augmented import fit_augmented
+from dt_viz.learning.demonstrations import Demonstration
+from dt_viz.learning.inspection import Repaired, repair
+from dt_viz.learning.patterns import AugmentedSettings, StartProcess
+from dt_viz.learning.preparation import PreparationSettings, prepare
+
+RNG = np.random.default_rng(5)
+TAKES = turning_takes()
+
+
+@pytest.fixture(scope="module")
+def imitation():
+    return fit_augmented(TAKES)
+
+
+def states(imitation, num=20, seed=0):
+    """States (num, 6 + 1 + 4) of poses beside the motions, at all phases."""
+    rng, poses = np.random.default_rng(seed), imitation.poses
+    begun = poses.states(np.hstack([imitation.starts[np.arange(num) % 5], 0.2 * rng.normal(size=(num, 3))]))
+    begun[:, 6] *= np.linspace(1.0, 0.05, num)
+    return begun
+
+
+class TestRotations:
+    def test_logarithm_and_exponential_undo_each_other_and_signs_change_nothing(self):
+        turned = TAKES[0].orientations
+        vectors = logarithm(GOAL, turned)
+        assert apart(exponential(GOAL, vectors), turned).max() < 1e-7
+        signs = RNG.choice([-1.0, 1.0], size=(150, 1))
+        np.testing.assert_allclose(logarithm(-GOAL, signs * turned), vectors, atol=1e-12)
+        np.testing.assert_allclose(apart(mean_orientation(signs * turned), mean_orientation(turned)), 0, atol=1e-7)
+
+    @pytest.mark.parametrize("turns", [0.4, 0.98, 1.6, 3.3])
+    def test_a_motion_that_turns_far_has_no_cut(self, turns):
+        axis = np.array([0.6, 0.0, 0.8])
+        vectors = np.linspace(2 * np.pi * turns, 0, 400)[:, None] * axis
+        np.testing.assert_allclose(logarithm(GOAL, exponential(GOAL, vectors)), vectors, atol=1e-7)
+        np.testing.assert_allclose(nearest(GOAL, exponential(GOAL, vectors[0]), vectors[1]), vectors[0], atol=1e-7)
+
+    def test_a_turn_of_the_world_leaves_vectors_as_they_are(self):
+        world, turned = Rotation.random(random_state=1), TAKES[0].orientations
+        both = [quaternions(world * rotation(q)) for q in (GOAL, turned)]
+        np.testing.assert_allclose(logarithm(*both), logarithm(GOAL, turned), atol=1e-7)
+
+
+class TestSystem:
+    def test_the_shear_undoes_itself_and_has_determinant_1(self, imitation):
+        psi, state = imitation.poses.system.transform, states(imitation)
+        image, J = psi.jacobian(state)
+        np.testing.assert_allclose(psi.inverse(image), state, atol=1e-14)
+        np.testing.assert_allclose(np.linalg.det(J), 1.0, atol=1e-10)
+        half = psi.scaled(0.5)  # a one-parameter group
+        np.testing.assert_allclose(half.forward(half.forward(state)), image, atol=1e-14)
+
+    def test_its_jacobian_is_that_of_finite_differences(self, imitation):
+        psi, state, h = imitation.poses.system.transform, states(imitation, 8), 1e-6
+        J = psi.jacobian(state)[1]
+        for k in range(10):  # the index of the pattern is no coordinate that changes
+            step = h * np.eye(11)[k]
+            slope = (psi.forward(state + step) - psi.forward(state - step)) / (2 * h)
+            np.testing.assert_allclose(J[..., k], slope, atol=3e-5)
+
+    def test_it_is_stable_and_what_turns_the_hand_aside_dies_away(self, imitation):
+        system, state = imitation.poses.system, states(imitation)
+        path = system.rollout(state, np.linspace(0, 6, 200))
+        values = system.lyapunov(path.reshape(-1, 11)).reshape(20, -1)
+        assert (np.diff(values) < 1e-12).all()
+        assert (values[:, 0] > 1e-3).all()
+        end = system.rollout(state, np.array([40.0]))[:, 0]
+        goal = imitation.poses.orientations(end[:, 3:6])
+        assert apart(goal, imitation.goal_orientation).max() < 1e-3
+        np.testing.assert_allclose(end[:, :3], imitation.goal[None].repeat(20, 0), atol=1e-3)
+
+    def test_velocities_are_the_derivatives_of_motions(self, imitation):
+        system, state, h = imitation.poses.system, states(imitation, 6), 1e-5
+        slope = (system.rollout(state, np.array([h]))[:, 0] - state) / h
+        np.testing.assert_allclose(system.velocity(state), slope, atol=2e-3)
+
+    def test_its_places_are_those_of_the_imitation(self, imitation):
+        times, state = np.linspace(0, 5, 30), states(imitation)
+        places = imitation.system.rollout(np.delete(state, np.s_[3:6], axis=1), times)
+        np.testing.assert_allclose(imitation.poses.system.rollout(state, times)[..., :3], places[..., :3], atol=1e-14)
+
+    def test_the_slope_of_a_process_with_a_narrow_kernel_is_that_of_differences(self):
+        starts, at, h = RNG.normal(size=(6, 3)), 0.1 * RNG.normal(size=3), 1e-6
+        process = StartProcess.of(starts, RNG.normal(size=(6, 4, 2)), 0.8, 2.0, 0.7, 0.3, 0.1)
+        slopes = [(process.at(at + h * e) - process.at(at - h * e)) / (2 * h) for e in np.eye(3)]
+        np.testing.assert_allclose(process.slope_at(at), np.stack(slopes, -1), atol=1e-7)
+
+
+class TestMotion:
+    def test_from_its_own_start_a_take_is_turned_as_it_was(self):
+        motion = dt.fit(TAKES)
+        assert motion.state == "augmented" and "orientation" in motion.reason and "with orientation" in repr(motion)
+        for take, path in zip(TAKES, motion.rollouts(), strict=True):
+            near = np.linalg.norm(take.positions - path.positions[:, None], axis=-1).argmin(axis=1)
+            off = np.rad2deg(apart(path.orientations, take.orientations[near]))
+            assert np.median(off) < 1.5 and off.max() < 5
+            assert apart(path.orientations[-1:], motion.rollouts()[0].orientations[-1]).max() < 1e-7
+
+    def test_signs_of_quaternions_change_nothing(self):
+        flipped = [
+            Demonstration(t.times, t.positions, t.name, RNG.choice([-1.0, 1.0], (150, 1)) * t.orientations)
+            for t in TAKES
+        ]
+        for one, other in zip(dt.fit(TAKES).rollouts(), dt.fit(flipped).rollouts(), strict=True):
+            assert apart(one.orientations, other.orientations).max() < 1e-6
+            np.testing.assert_allclose(one.positions, other.positions, atol=1e-9)
+
+    def test_a_turn_of_the_world_turns_the_motion(self):
+        world = Rotation.from_rotvec([0.4, -0.7, 1.1])
+        there = [
+            Demonstration(t.times, world.apply(t.positions), t.name, quaternions(world * rotation(t.orientations)))
+            for t in TAKES
+        ]
+        start = np.array([[0.42, 0.13, 0.22]])
+        (one,), (other,) = dt.fit(TAKES).rollouts(start), dt.fit(there).rollouts(world.apply(start))
+        np.testing.assert_allclose(world.apply(one.positions), other.positions, atol=1e-6)
+        assert apart(quaternions(world * rotation(one.orientations)), other.orientations).max() < 1e-5
+
+    def test_a_turned_hand_comes_back_and_its_places_stay(self):
+        motion = dt.fit(TAKES)
+        usual, turned = motion.rollouts()[0], motion.rollouts(orientations=TAKES[2].orientations[40])[0]
+        np.testing.assert_array_equal(usual.positions, turned.positions)
+        off = apart(usual.orientations, turned.orientations)
+        assert off[0] > 0.2 and off[-1] < 1e-6 and (np.diff(off) < 1e-9).all()
+
+    def test_a_hand_in_the_loop_is_turned_to_the_goal(self):
+        motion = dt.fit(TAKES)
+        place, hand, h = TAKES[0].positions[0], rotation(TAKES[0].orientations[60]), 0.02
+        controller = dt.HandController(motion, place)
+        for k in range(500):
+            turn = controller.turn(quaternions(hand), h)
+            place = place + h * controller.step(place, h)
+            hand = Rotation.from_rotvec(h * turn) * hand
+            if k == 60:
+                hand = Rotation.from_rotvec([0.5, 0.0, 0.0]) * hand  # somebody turns it
+        assert apart(quaternions(hand)[None], motion.rollouts()[0].orientations[-1]).max() < 1e-3
+
+    def test_saving_keeps_it(self, tmp_path):
+        motion = dt.fit(TAKES)
+        motion.save(tmp_path / "turns.npz")
+        for one, other in zip(motion.rollouts(), dt.Motion.load(tmp_path / "turns.npz").rollouts(), strict=True):
+            np.testing.assert_array_equal(one.orientations, other.orientations)
+
+    def test_what_does_not_learn_it_says_so(self):
+        plain = dt.fit(TAKES, state="plain")
+        assert plain.rollouts()[0].orientations is None and "not learned in the plain state" in plain.report()
+        mixed = dt.fit([*TAKES[1:], Demonstration(TAKES[0].times, TAKES[0].positions, "bare")], state="augmented")
+        assert mixed.rollouts()[0].orientations is None and "'bare' has none" in mixed.report()
+        with pytest.raises(dt.FormatError, match="no orientations were learned"):
+            plain.rollouts(orientations=GOAL)
+        with pytest.raises(dt.FormatError, match="quaternions wxyz"):
+            dt.fit(TAKES).rollouts(orientations=np.ones(3))
+        with pytest.raises(dt.DataError, match="orientations of '0'"):
+            dt.fit([Demonstration(TAKES[0].times, TAKES[0].positions, "0", np.zeros((150, 4)))])
+
+    def test_places_without_orientations_are_learned_as_ever(self):
+        bare = [Demonstration(take.times, take.positions, take.name) for take in TAKES]
+        settings = [AugmentedSettings(turn_length=length) for length in (0.1, 3.0)]
+        one, other = (dt.fit(bare, state="augmented", augmented=each).rollouts()[0] for each in settings)
+        np.testing.assert_array_equal(one.positions, other.positions)
+        assert one.orientations is None
+
+
+class TestPreparation:
+    def test_a_hand_that_only_turns_does_not_pause(self):
+        times, still = np.linspace(0, 6, 300), np.linspace(0, 1, 100)
+        there, corner = np.outer(still, [0.2, 0, 0]), np.tile([0.2, 0, 0], (100, 1))
+        path = np.concatenate([there, corner, corner + np.outer(still, [0, 0.2, 0])])
+        angle = np.concatenate([np.zeros(100), np.linspace(0, 1.5, 100), np.full(100, 1.5)])
+        turned = exponential(GOAL, angle[:, None] * [0.0, 0.0, 1.0])
+        found = []
+        for orientations in (None, np.tile(GOAL, (300, 1)), turned):
+            take = Repaired(Demonstration(times, path, "t", orientations), times, path)
+            repair([take], PreparationSettings())
+            found.append([each.kind for each in take.findings])
+        assert found == [["pause"], ["pause"], []]
+
+    def test_orientations_go_with_what_is_cut_off_at_the_start(self):
+        u = np.linspace(0, 2 * np.pi, 200)
+        path = 0.2 * np.column_stack([np.sin(u), 1 - np.cos(u), 0 * u])  # begins at its goal
+        turned = exponential(GOAL, (2 * np.pi - u)[:, None] * [0.2, 0, 0])
+        take = Demonstration(np.linspace(0, 5, 200), path, "round", turned)
+        motions = prepare([take])
+        assert len(motions.turns[0]) == len(motions.positions[0]) < 200
+        first = 200 - len(motions.turns[0])
+        np.testing.assert_allclose(motions.turns[0], (2 * np.pi - u)[first:, None] * [0.2, 0, 0], atol=1e-6)
+
+    def test_more_than_half_a_turn_is_said(self):
+        with pytest.warns(dt.DemonstrationWarning, match="turns by"):
+            far = dt.fit(turning_takes(turn=4.0))
+        assert "away from the orientation at the goal" in far.report()
+        off = apart(far.rollouts()[0].orientations[:1], turning_takes(turn=4.0)[0].orientations[:1])
+        assert np.rad2deg(off).max() < 3
