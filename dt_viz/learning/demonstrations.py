@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Any, BinaryIO, Protocol
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from dt_viz.errors import DataError, FormatError, naming, parsing
 from dt_viz.files.checks import check_at_most, check_finite, real_numbers
 from dt_viz.files.folders import bag_folder, files_of, is_bag, is_lerobot, lerobot_folder
 from dt_viz.files.tables import ReadOptions, at_sample
 from dt_viz.files.takes import READERS, Take, in_si_units, read_takes
+from dt_viz.flows.rotations import turned
 
 logger = logging.getLogger(__name__)
 
@@ -281,7 +281,7 @@ def demonstrations_of(
         logger.warning("%s%s: %s", paths[0], f" and {len(paths) - 1} more" * (len(paths) > 1), note)
     with parsing(DemonstrationError, source, "takes", "recorded motions"):
         takes, note = in_si_units([take for _, some, _ in found for take in some], _num_joints(arm))
-        takes = [_turned(take, arm) for take in takes]
+        takes = [_in_frame_of(take, arm) for take in takes]
         if note:
             logger.warning("%s: %s", source, note)
         check_at_most("demonstrations", len(takes), MAX_DEMONSTRATIONS)
@@ -332,15 +332,12 @@ def _num_joints(arm: ForwardKinematics | None) -> int | None:
     return None if arm is None else len(arm.joint_names)
 
 
-def _turned(take: Take, arm: ForwardKinematics | None) -> Take:
+def _in_frame_of(take: Take, arm: ForwardKinematics | None) -> Take:
     """Turn what was recorded in the frame of an arm's base to the frame that the arm is used in."""
     base: np.ndarray = np.eye(3) if arm is None else getattr(arm, "base", np.eye(3))
     if take.positions is None or take.positions.shape[1] != len(base) or np.array_equal(base, np.eye(3)):
         return take
-    wxyz = take.orientations
-    if wxyz is not None:
-        turned = Rotation.from_matrix(base) * Rotation.from_quat(np.roll(wxyz, -1, axis=1))
-        wxyz = np.roll(turned.as_quat(), 1, axis=1)
+    wxyz = None if take.orientations is None else turned(base, take.orientations)
     return replace(take, positions=take.positions @ base.T, orientations=wxyz)
 
 

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from dt_viz.control.controller import ArmController
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.flows.fields import Array
-from dt_viz.flows.rotations import apart
+from dt_viz.flows.rotations import apart, turned
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.library.motion import NUM_COORDINATES, Motion
 from dt_viz.library.motion import Path as HandPath
@@ -75,7 +75,7 @@ class Arm:
             raise ValueError(f"frame: found {frame!r}; accepted: {', '.join(get_args(Frame))}")
         self._on_page = robot
         self.robot = robot.in_base_frame() if frame == "base" else robot
-        self._follower = Follower(robot)
+        self._follower = Follower(self.robot)
 
     @classmethod
     def from_urdf(
@@ -140,8 +140,13 @@ class Arm:
         if demonstrations and demonstrations[0].dimension != NUM_COORDINATES:
             raise ValueError(f"the arm follows motions in space, with 3 coordinates, not {demonstrations[0].dimension}")
         placed = place(self._on_page, [demonstration.positions for demonstration in demonstrations], scale)
-        turn = self._on_page.base @ self.robot.base.T
-        return tuple(replace(one, positions=placed(one.positions) @ turn) for one in demonstrations)
+        turn = self.robot.base @ self._on_page.base.T
+
+        def in_reach(one: Demonstration) -> Demonstration:
+            wxyz = None if one.orientations is None else turned(turn, one.orientations)
+            return replace(one, positions=placed(one.positions) @ turn.T, orientations=wxyz)
+
+        return tuple(map(in_reach, demonstrations))
 
     def __repr__(self) -> str:
         return f"Arm({self.robot.title}: {self.robot.num_joints} joints, reach {self.robot.reach:.2f} m)"

@@ -4,6 +4,7 @@
 # (coal has no stubs)
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Literal
@@ -462,6 +463,23 @@ def test_a_placed_task_is_followed_by_the_same_joints_in_both_frames(name):
         assert followed.error.max() < 1e-3
         joints.append(followed.q)
     np.testing.assert_allclose(joints[0], joints[1], atol=1e-6)
+
+
+@each_arm
+def test_the_whole_arm_moves_around_a_ball_in_the_frame_of_its_base(name):
+    arm, (take, *others) = dt.load_arm(name), dt.example("push_box")[:3]
+    upright = replace(take, orientations=np.tile([1.0, 0, 0, 0], (len(take.times), 1)))
+    takes = arm.place([upright, *others])
+    turn = dt.load_arm(name, frame="page").base.T
+    assert takes[0].orientations is not None
+    about = np.arctan2(turn[1, 0], turn[0, 0])
+    np.testing.assert_allclose(np.abs(takes[0].orientations[0] @ [np.cos(about / 2), 0, 0, np.sin(about / 2)]), 1)
+    x, y, z = (float(c) for c in takes[0].positions[len(takes[0].positions) // 2])
+    ball = dt.Sphere((x, y, z), diameter=0.1 * arm.robot.size)
+    motion = dt.fit([replace(one, orientations=None) for one in takes], state="plain")
+    for path in arm.rollouts(motion.stack(dt.ArmAvoidance(ball, margin=0.01 * arm.robot.size))):
+        assert arm.robot.body.clearance(arm.robot, path.q, ball).min() > 0.01 * arm.robot.size - 1.1e-3
+        assert path.error[[0, -1]].max() < 1e-3 and path.error.max() > 0.02 * arm.robot.size
 
 
 def test_another_frame_is_refused_with_a_line():
