@@ -23,6 +23,18 @@ class ImitationError(ValueError):
     """Demonstrations from which no stable system can be learned; the message names the demonstration and the reason."""
 
 
+class NoCommonGoalError(ImitationError):
+    """Demonstrations that end at several places, none of them the place of most.
+
+    Attributes:
+        goals: for each place, what ends there and where, and the place (d,), metres; those of most takes first.
+    """
+
+    def __init__(self, message: str, goals: Sequence[tuple[str, tuple[float, ...]]]) -> None:
+        super().__init__(message)
+        self.goals = tuple(goals)
+
+
 class DemonstrationWarning(UserWarning):
     """Something odd about demonstrations, and what was done about it."""
 
@@ -166,7 +178,7 @@ def _common_goal(takes: Sequence[Repaired], spread: float, settings: Preparation
             around = np.linalg.norm(ends[:, None] - ends, axis=-1) <= reach
             near = around[around.sum(axis=1).argmax()]
         if 2 * near.sum() <= len(ends):
-            raise ImitationError(_no_common_goal(takes, ends, reach))
+            raise _no_common_goal(takes, ends, reach)
         goal = ends[near].mean(axis=0)
         if not settings.move_ends:
             goal = ends[np.linalg.norm(ends - goal, axis=1).argmin()]
@@ -202,7 +214,7 @@ def _given_goal(given: Sequence[float], ends: Array, reach: float) -> Array:
     return goal
 
 
-def _no_common_goal(takes: Sequence[Repaired], ends: Array, reach: float) -> str:
+def _no_common_goal(takes: Sequence[Repaired], ends: Array, reach: float) -> NoCommonGoalError:
     """Say which takes end where, and how to choose."""
     left, groups = np.ones(len(ends), bool), []
     while left.any():
@@ -211,12 +223,14 @@ def _no_common_goal(takes: Sequence[Repaired], ends: Array, reach: float) -> str
         left[group] = False
         names = ", ".join(f"'{takes[k].demonstration.name}'" for k in group[:3])
         more = f" and {len(group) - 3} more" if len(group) > 3 else ""
-        groups.append(f"{names}{more} at {in_metres(ends[group].mean(axis=0))}")
+        goal = ends[group].mean(axis=0)
+        groups.append((f"{names}{more} at {in_metres(goal)}", tuple(goal.tolist())))
     several = f" and {len(groups) - 4} more places" if len(groups) > 4 else ""
-    return (
-        f"the demonstrations have no common goal, they end at {'; '.join(groups[:4])}{several}. "
+    message = (
+        f"the demonstrations have no common goal, they end at {'; '.join(text for text, _ in groups[:4])}{several}. "
         f"Choose one of these places as the goal (goal=…), or learn the takes of each place by themselves"
     )
+    return NoCommonGoalError(message, groups)
 
 
 def _lead_to_goal(take: Repaired, goal: Array, near: float) -> None:

@@ -254,6 +254,7 @@ class Follower:
             "reference_postures",
             (self.robot, learned),
             lambda: reference_postures(self.robot, usual, learned.task.starts, _mean(paths)),
+            newest=NUM_POSTURES,
         )
 
     def out_of_reach(self, nominal: Nominal) -> Mask:
