@@ -82,24 +82,24 @@ class Engine:
         """
         return self.own[name][0] if name in self.own else self._tasks[name]()
 
-    def bring(self, task: Task, shown: str) -> tuple[str, str | None]:
+    def bring(self, task: Task, shown: str) -> tuple[Task, str | None]:
         """Take a task of the visitor's own.
 
         Args:
-            task: the task; it gets a name and a title of its own.
+            task: the task.
             shown: name of the task that is shown now, which stays.
 
         Returns:
-            Its name, and that of the own task that had to go, if one had.
+            The task with a name and a title of its own, and the name of the own task that had to go, if one had.
         """
         number = max((int(name.rpartition("_")[2]) for name in self.own), default=0) + 1
-        name, title = f"{OWN}_{number}", f"Your data {number}" if self.own else "Your data"
+        task = replace(task, name=f"{OWN}_{number}", title=f"Your data {number}" if number > 1 else "Your data")
         oldest = next((name for name in self.own if name != shown), None) if len(self.own) >= MOST_OWN else None
         own = {name: kept for name, kept in self.own.items() if name != oldest}
-        self.own = own | {name: (replace(task, name=name, title=title), FitStore(None))}  # at once: others read it
+        self.own = own | {task.name: (task, FitStore(None))}  # at once: others read it
         if oldest is not None:
             self._last.pop(oldest, None)
-        return name, oldest
+        return task, oldest
 
     def frames(
         self, scenario: Scenario, progress: Progress | None = None, cancelled: Cancelled = never

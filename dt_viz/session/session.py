@@ -143,18 +143,13 @@ class Session:
             stack, view = as_fresh(self.scenario, fresh), replace(self.scenario.view, slice=None)
             self.step("task", task=name, arm_rollout=0, starts=fresh.starts, stack=stack, view=view)
 
-    def learn(self, task: Task) -> None:
-        """Begin with a task of the visitor's own, with what else was chosen; can be undone."""
-        name, gone = self._engine.bring(task, self.scenario.task)
+    def bring(self, task: Task) -> tuple[Task, str | None]:
+        """Take a task of the visitor's own, to be chosen; see `Engine.bring`."""
+        own, gone = self._engine.bring(task, self.scenario.task)
         if gone is not None:
             with self._lock:
                 self._history.forget(gone)
-        self.choose_task(name)
-
-    @property
-    def own_titles(self) -> dict[str, str]:
-        """Titles of the visitor's own tasks, by name."""
-        return {name: task.title for name, (task, _) in self._engine.own.items()}
+        return own, gone
 
     def reset(self) -> None:
         """Back to how the task or the scene began, and was looked at; the motion's part of it can be undone."""
