@@ -184,17 +184,17 @@ def _common_goal(takes: Sequence[Repaired], spread: float, settings: Preparation
             goal = ends[np.linalg.norm(ends - goal, axis=1).argmin()]
     for take, end in zip(takes, ends, strict=True):
         off = float(np.linalg.norm(end - goal))
-        text = f"ends {in_millimetres(off)} from the {'common goal' if settings.goal is None else 'goal'}"
+        text, amount = f"ends {{}} from the {'common goal' if settings.goal is None else 'goal'}", in_millimetres(off)
         if off > reach and settings.leave_out:
-            take.leave_out("elsewhere", text)
+            take.leave_out("elsewhere", text, amount)
         elif 0 < off <= take.jitter and settings.move_ends:
             take.positions = _end_moved(take.positions, goal)
         elif off <= settings.same_goal * spread:
             continue
         elif not settings.move_ends:
-            take.leave_out("end", text)
+            take.leave_out("end", text, amount)
         else:
-            take.find("end", text, "its end is moved there")
+            take.find("end", text, "its end is moved there", amount)
     if not any(take.kept for take in takes):
         raise ImitationError("no demonstration ends at the goal; accepted: move_ends=True, which moves ends there")
     return goal
@@ -242,7 +242,8 @@ def _lead_to_goal(take: Repaired, goal: Array, near: float) -> None:
     elif np.linalg.norm(path[0] - goal) <= near:
         first = away[0]
         text = "starts at the goal, where a stable motion ends"
-        take.find("start", text, f"its first {take.times[first]:.2g} s are left out")
+        amount = f"{take.times[first]:.2g} s"
+        take.find("start", text, f"its first {amount} are left out", amount)
         take.times, take.positions = take.times[first:] - take.times[first], path[first:]
 
 

@@ -72,6 +72,8 @@ class Task:
     """Whether the hand holds a pen and draws on the slice."""
     preparation: PreparationSettings = field(default_factory=PreparationSettings)
     """Settings of what is done to the demonstrations before they are learned."""
+    seen: tuple[str, ...] = ()
+    """What was found about the demonstrations and shown before they were learned: it is no warning any more."""
 
     def to_world(self, points: Array) -> Array:
         """Transform points (*B, k) of the demonstrations to the world, (*B, 3), metres."""

@@ -209,9 +209,12 @@ def _inspected(used: Sequence[Demonstration], choices: Choices, robot: Robot) ->
     except ImitationError as error:
         problem = str(error) if chosen else "Every take is left out; choose at least one."
     kept = numbers if motions is not None else range(len(used))
-    task = replace(own_task(tuple(used[k] for k in kept)), preparation=settings)
-    if used[0].dimension == 2:  # drawings are placed; positions in space are where they are
-        task = replace(in_reach({OWN: TaskEntry(task.title, lambda: task)}, robot)[OWN](), preparation=settings)
+    given = replace(
+        own_task(tuple(used[k] for k in kept)), preparation=settings, seen=() if motions is None else motions.warnings
+    )
+    # drawings are placed; positions in space are where they are
+    entry = {OWN: TaskEntry(given.title, lambda: given)}
+    task = in_reach(entry, robot)[OWN]() if used[0].dimension == 2 else given
     learned = {} if motions is None else dict(zip(numbers, motions.positions, strict=True))
     takes = tuple(
         SeenTake(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -30,16 +30,30 @@ from dt_viz.ui.tabs.status import COLOURS
 from dt_viz.warning import Severity
 
 FORMATS = ", ".join(suffix[1:] for suffix in (*READERS, ARCHIVE))
-SWITCHES: Mapping[FindingKind, tuple[str, str]] = {
-    "units": ("convert_units", "Convert takes in other units"),
-    "outliers": ("drop_outliers", "Leave out single outliers"),
-    "gap": ("bridge_gaps", "Bridge gaps by curves"),
-    "jitter": ("smooth_jitter", "Smooth jitter"),
-    "pause": ("cut_pauses", "Cut pauses"),
-    "end": ("move_ends", "Move ends to the goal"),
-    "elsewhere": ("leave_out", "Leave out takes that end elsewhere"),
+SWITCHES: Mapping[FindingKind, tuple[str, str, str]] = {
+    "units": ("convert_units", "Convert units", "of takes that seem to be in another unit than the others"),
+    "outliers": ("drop_outliers", "Drop outliers", "single samples far off"),
+    "gap": ("bridge_gaps", "Bridge gaps", "times without samples, by a curve; otherwise by a straight line"),
+    "jitter": ("smooth_jitter", "Smooth jitter", "faster trembling than a hand means to move"),
+    "pause": ("cut_pauses", "Cut pauses", "times in which a take stands still, and most others do not"),
+    "end": ("move_ends", "Move ends", "to the goal; otherwise takes that end beside it are left out"),
+    "elsewhere": (
+        "leave_out",
+        "One goal only",
+        "takes that end elsewhere are left out; otherwise their ends are moved",
+    ),
 }
-"""What is done about a kind of finding: the field of `PreparationSettings`, and the label of its switch."""
+"""What is done about a kind of finding: the field of `PreparationSettings`, label and hint of its switch."""
+HEADS: Mapping[FindingKind, tuple[str, str]] = {
+    "units": ("unit", "another unit than the others’"),
+    "outliers": ("outlier", "single samples far off: their distance, or their number"),
+    "gap": ("gap", "longest time without samples"),
+    "jitter": ("jitter", "how far it trembles"),
+    "pause": ("pause", "how long it stands still"),
+    "end": ("end", "distance of its end from the goal"),
+    "start": ("start", "how long it stays at the goal at first"),
+}
+"""Heads of the table's columns, and what they mean."""
 READINGS = {"t,x,y": "times", "x,y,z": "x, as the next ones are y and z"}
 """What the first of three columns without names is, by the reading of all three."""
 
@@ -85,7 +99,7 @@ class OpenPanel:
         with self.folder:
             hint = f"{FORMATS}; several at once, one after another, or a zip of a folder"
             self.upload = gui.add_upload_button("Choose files, or drop them here", icon=viser.Icon.UPLOAD, hint=hint)
-            gui.add_html(drop_html(self.upload))
+            gui.add_html(drop_html(self.upload, most))
             self.table = gui.add_html("")
             self.controls = self._add_controls(gui)
             self.start = gui.add_button("Learn", icon=viser.Icon.SCHOOL, color=LIGHT.brand, disabled=True)
@@ -109,12 +123,12 @@ class OpenPanel:
             found[name] = Control(gui.add_dropdown(label, options, hint=hint, visible=False), act)
 
         dropdown("take", "Take", (NO_COLUMN,), self._point, "the take that is named in the scene")
-        box = gui.add_checkbox("Learn from this take", True, visible=False)
+        box = gui.add_checkbox("Use this take", True, visible=False)
         found["chosen"] = Control(box, self._leave_out)
-        for kind, (name, label) in SWITCHES.items():
-            box = gui.add_checkbox(label, True, visible=False)
+        for kind, (name, label, hint) in SWITCHES.items():
+            box = gui.add_checkbox(label, True, hint=hint, visible=False)
             found[kind] = Control(box, lambda on, name=name: at(lambda c: {"preparation": _with(c, name, on)}))
-        box = gui.add_checkbox("Scale into the arm's reach", False, visible=False)
+        box = gui.add_checkbox("Scale to fit", False, hint="into the arm's reach", visible=False)
         found["reach"] = Control(box, lambda on: at(lambda _: {"fits_reach": on}))
         hint = "the place at which motions end; takes that end elsewhere are left out"
         dropdown("goal", "Goal", ("1",), lambda goal: at(lambda _: {"goal": int(goal.split()[0]) - 1}), hint)
@@ -248,7 +262,7 @@ class OpenPanel:
         number, settings = self._number, opened.choices.preparation
         self._turn("chosen", seen.takes[number].is_chosen, shown=True)
         found = {finding.kind for take in seen.takes for finding in take.inspection.findings}
-        for kind, (name, _) in SWITCHES.items():
+        for kind, (name, *_) in SWITCHES.items():
             on = bool(getattr(settings, name))
             self._turn(kind, on, shown=kind in found or not on)
         self._turn("reach", opened.choices.fits_reach, shown=bool(seen.reach))
@@ -290,29 +304,46 @@ def _with(choices: Choices, name: str, on: bool) -> Any:  # noqa: ANN401 - Prepa
 
 
 def seen_html(seen: Preview, number: int) -> str:
-    """Return what was found of each take, the chosen one marked, and what else is to be known."""
+    """Return a table of what was found of each take, the chosen one marked, and what else is to be known."""
     several = f"The takes end at {len(seen.goals)} places, none of them that of most: “Goal” chooses one."
     alarms = [text for text in (seen.problem, seen.reach, several if seen.goals else "") if text]
     told = [f"<div style='color:{ink(COLOURS[Severity.WARNING][0])}'>{html.escape(text)}</div>" for text in alarms]
     told += [f"<div>{html.escape(note)}</div>" for note in seen.notes]
-    rows = "".join(_row(k, take, chosen=k == number) for k, take in enumerate(seen.takes))
-    table = f"<div style='max-height:21em;overflow-y:auto'>{rows}</div>"
-    return small("".join(told)) * bool(told) + small(table)
+    found = {finding.kind for take in seen.takes if take.learned is not None for finding in take.inspection.findings}
+    heads = [kind for kind in HEADS if kind in found]
+    rows = "".join(_row(k, take, heads, chosen=k == number) for k, take in enumerate(seen.takes))
+    titles = "".join(
+        f"<td style='text-align:right;opacity:0.65;padding-left:0.6em' title='{hint}'>{title}</td>"
+        for title, hint in (("s", "duration"), ("Hz", "samples a second"), *(HEADS[kind] for kind in heads))
+    )
+    table = f"<table style='width:100%;font-size:0.9em;white-space:nowrap'><tr><td></td>{titles}</tr>{rows}</table>"
+    return small("".join(told)) * bool(told) + small(f"<div style='max-height:21em;overflow:auto'>{table}</div>")
 
 
-def _row(number: int, take: SeenTake, *, chosen: bool) -> str:
-    own = take.inspection
-    left, colours = take.learned is None, LIGHT.takes
-    colour = LIGHT.stale if left else colours[number % len(colours)]
-    said = [f"{each.text}{': ' if each.remedy else ''}{each.remedy}" for each in own.findings]
+def _row(number: int, take: SeenTake, heads: Sequence[FindingKind], *, chosen: bool) -> str:
+    """Return the row of a take: how large what was found is, or why it is left out; tooltips have all of it."""
+    own, left = take.inspection, take.learned is None
+    colour = LIGHT.stale if left else LIGHT.takes[number % len(LIGHT.takes)]
+    said = [f"{each.text}: {each.remedy or 'nothing is done'}" for each in own.findings]
     said += ["out of the arm's reach"] * take.is_far + ["left out by you"] * (not take.is_chosen)
-    mark = f"flex:none;width:1.4em;border-top:0.3em {'dashed' if left else 'solid'} {css(colour)};margin-right:0.5em"
-    figures = f"{own.duration:.3g} s · {own.num_samples} samples · {own.rate:.3g} Hz"
+    mark = f"display:inline-block;width:1.1em;border-top:0.28em {'dashed' if left else 'solid'} {css(colour)}"
+    cells = [("", f"{own.duration:.2f}", False), ("", f"{own.rate:.3g}", False)]
+    for kind in heads:
+        of_kind = [each for each in own.findings if each.kind == kind]
+        amounts = ", ".join(each.amount or "✓" for each in of_kind)
+        cells.append(("; ".join(each.text for each in of_kind), amounts, any(not each.remedy for each in of_kind)))
+    warned = f";font-weight:700;color:{ink(COLOURS[Severity.WARNING][0])}"
+    figures = "".join(
+        f"<td style='text-align:right;padding-left:0.6em{warned if is_left else ''}' title='{html.escape(title)}'>"
+        f"{html.escape(text)}</td>"
+        for title, text, is_left in (cells[:2] if left else cells)
+    )
+    why = html.escape(said[-1] if said else "left out")
+    far = f"<td style='{warned[1:]}'>out of reach</td>" if take.is_far else ""
+    reason = f"<td colspan='{len(heads)}' style='padding-left:0.6em;white-space:normal'>{why}</td>" if left else far
     return (
-        f"<div style='margin-bottom:0.35em{';opacity:0.6' if left else ''}' title='{html.escape(own.name)}'>"
-        f"<div style='display:flex;align-items:center;white-space:nowrap'><span style='{mark}'></span>"
-        f"<span style='font-weight:{700 if chosen else 600};overflow:hidden;text-overflow:ellipsis'>"
-        f"{number + 1} · {html.escape(own.name)}</span>"
-        f"<span style='margin-left:auto;padding-left:0.6em;opacity:0.75'>{figures}</span></div>"
-        f"<div style='margin-left:1.9em;line-height:1.25'>{html.escape('; '.join(said)) or '✓'}</div></div>"
+        f"<tr style='{'opacity:0.6' if left else ''}' title='{html.escape('; '.join(said))}'>"
+        f"<td style='font-weight:{700 if chosen else 400};max-width:8em;overflow:hidden;text-overflow:ellipsis'>"
+        f"<span style='{mark};vertical-align:0.2em;margin-right:0.4em'></span>{html.escape(own.name)}</td>"
+        f"{figures}{reason}</tr>"
     )
