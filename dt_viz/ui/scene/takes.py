@@ -35,7 +35,7 @@ class Takes(Shown):
             own = [take.learned for take in seen.takes[k :: len(self.learned)] if take.learned is not None]
             lines.show([_thinned(path, most) for path in own], theme)
         self.given.show([_thinned(take.given, most) for take in seen.takes if take.learned is not None], theme)
-        self.left_out.show([_thinned(take.given, most) for take in seen.takes if take.learned is None], theme)
+        self.left_out.show([_thinned(take.given, min(most, 150)) for take in seen.takes if take.learned is None], theme)
         self.goal.visible = seen.goal is not None
         if seen.goal is not None:
             self.goal.position = seen.goal

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import html
-from collections.abc import Callable, Mapping, Sequence
+import threading
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -11,22 +11,20 @@ from typing import Any
 import viser
 
 from dt_viz.errors import DataError
-from dt_viz.files.checks import check_at_most
 from dt_viz.files.recordings import ARCHIVE, AXES, NO_COLUMN, Recordings
 from dt_viz.files.takes import READERS
 from dt_viz.files.uploads import make_ready
 from dt_viz.learning.inspection import FindingKind
 from dt_viz.scenario.tasks import Task
 from dt_viz.session import opening
-from dt_viz.session.opening import LENGTHS, USUAL_RATES, Choices, Preview, SeenTake
+from dt_viz.session.opening import LENGTHS, USUAL_RATES, Choices, Preview
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.controls import Control, on_press
 from dt_viz.ui.dropping import drop_html
-from dt_viz.ui.scene.palette import LIGHT, css, ink
+from dt_viz.ui.scene.palette import LIGHT
 from dt_viz.ui.tabs.from_file import LANE, turn
-from dt_viz.ui.tabs.plots import small
-from dt_viz.ui.tabs.status import COLOURS
+from dt_viz.ui.tabs.takes_table import seen_html
 from dt_viz.warning import Severity
 
 FORMATS = ", ".join(suffix[1:] for suffix in (*READERS, ARCHIVE))
@@ -44,16 +42,8 @@ SWITCHES: Mapping[FindingKind, tuple[str, str, str]] = {
     ),
 }
 """What is done about a kind of finding: the field of `PreparationSettings`, label and hint of its switch."""
-HEADS: Mapping[FindingKind, tuple[str, str]] = {
-    "units": ("unit", "another unit than the others’"),
-    "outliers": ("outlier", "single samples far off: their distance, or their number"),
-    "gap": ("gap", "longest time without samples"),
-    "jitter": ("jitter", "how far it trembles"),
-    "pause": ("pause", "how long it stands still"),
-    "end": ("end", "distance of its end from the goal"),
-    "start": ("start", "how long it stays at the goal at first"),
-}
-"""Heads of the table's columns, and what they mean."""
+SEEING = "preview"
+"""Lane of the session's jobs on which what is open is inspected."""
 READINGS = {"t,x,y": "times", "x,y,z": "x, as the next ones are y and z"}
 """What the first of three columns without names is, by the reading of all three."""
 
@@ -67,6 +57,9 @@ class Opened:
     answers: Mapping[str, Any] = field(default_factory=dict)
     """What was answered to the files' questions, by what these are about."""
     recordings: Recordings = field(default_factory=Recordings)
+    """What was read of the files."""
+    num_read: int = 0
+    """Number of files of which they were read."""
     choices: Choices = field(default_factory=Choices)
 
 
@@ -90,11 +83,12 @@ class OpenPanel:
             most: largest number of bytes of all files.
         """
         self._bindings, self._show, self._learn, self._most = bindings, show, learn, most
+        self._changing = threading.RLock()  # one thread reads, another inspects, and handlers close what is open
         self._opened = Opened()
         self._seen: Preview | None = None
-        self.button = gui.add_button(
-            "Open your demonstrations", icon=viser.Icon.FOLDER_OPEN, hint=f"recorded motions of your own: {FORMATS}"
-        )
+        """What is shown of it."""
+        hint = f"recorded motions of your own: {FORMATS}"
+        begin = gui.add_button("Open your demonstrations", icon=viser.Icon.FOLDER_OPEN, hint=hint)
         self.folder = gui.add_folder("Your data", visible=False)
         with self.folder:
             hint = f"{FORMATS}; several at once, one after another, or a zip of a folder"
@@ -102,18 +96,16 @@ class OpenPanel:
             gui.add_html(drop_html(self.upload, most))
             self.table = gui.add_html("")
             self.controls = self._add_controls(gui)
-            self.start = gui.add_button("Learn", icon=viser.Icon.SCHOOL, color=LIGHT.brand, disabled=True)
-            cancel = gui.add_button("Cancel", icon=viser.Icon.X)
-        on_press(self.button, self.open)
-        on_press(self.start, self._press)
+            start = gui.add_button("Learn", icon=viser.Icon.SCHOOL, color=LIGHT.brand, disabled=True)
+            cancel = gui.add_button("Cancel", icon=viser.Icon.X, color="gray")
+        self.controls["open"] = Control(begin, lambda _pressed: self.open())
+        self.controls["learn"] = Control(start, lambda _pressed: self._press())
         on_press(cancel, self.close)
         bindings.show(lambda s: (s.task, s.scene), lambda _chosen: self.close())
 
         @self.upload.on_upload
         async def _(_event: viser.GuiEvent) -> None:
-            file = self.upload.value
-            if self.folder.visible:
-                self._submit(partial(self.load, file.content, file.name))
+            self.load(self.upload.value.name, self.upload.value.content)
 
     def _add_controls(self, gui: viser.GuiApi) -> dict[str, Control]:
         """Build what is shown only where it is asked for, by names of their own."""
@@ -148,84 +140,95 @@ class OpenPanel:
 
     def open(self) -> None:
         """Show the folder, and get ready for files."""
-        self.folder.visible, self.button.visible = True, False
+        self.folder.visible, self.controls["open"].handle.visible = True, False
         self._bindings.session.jobs.submit(LANE, make_ready)
 
     def close(self) -> None:
         """Let go of what is open, and show what was shown before. Nothing is done while nothing is open."""
-        self._opened, seen, self._seen = Opened(), self._seen, None
-        self.folder.visible, self.button.visible, self.start.disabled = False, True, True
-        if seen is not None:
-            self._show(None, 0)
+        with self._changing:
+            seen, self._seen, self._opened = self._seen, None, Opened()
+            self.folder.visible, self.controls["open"].handle.visible = False, True
             self._draw()
+            if seen is not None:
+                self._show(None, 0)
 
-    def load(self, content: bytes, name: str) -> None:
-        """Add a file to what is open, and show all of it; or say why that cannot be.
+    def load(self, name: str, content: bytes) -> None:
+        """Have a file added to what is open; say why that cannot be. Nothing is done while the folder is hidden."""
+        session = self._bindings.session
+        if not self.folder.visible:
+            return
+        with self._changing:
+            files = (*self._opened.files, (name, content))
+            size = sum(len(each) for _, each in files)
+            if session.jobs.busy(LANE):
+                session.say("A file of yours is being read; open the next one after it.", Severity.WARNING)
+            elif size > self._most:
+                accepted = f"at most {self._most / 1e6:.0f} MB; the command line takes more"
+                session.say(f"{name}: files: found {size / 1e6:.1f} MB in all; accepted: {accepted}", Severity.ALARM)
+            else:
+                self._opened = replace(self._opened, files=files)
+                session.jobs.submit(LANE, self._read)
+
+    def _read(self) -> None:
+        """Read the files of what is open with what was answered; without the newest one if it cannot be read.
 
         Raises:
-            UnwantedError: the visitor has left.
+            UnwantedError: the visitor has left, or has closed what was open.
         """
-        opened = self._opened
-        files = (*opened.files, (name, content))
-        try:
-            size = sum(len(each) for _, each in files)
-            check_at_most("files", size // 10**6, self._most // 10**6, "MB in all")
-            self._read(replace(opened, files=files))
-        except ValueError as error:
-            self._bindings.session.say(str(error), Severity.ALARM)
-
-    def _submit(self, work: Callable[[], None]) -> None:
-        self._bindings.session.jobs.submit(LANE, work)
-
-    def _read(self, opened: Opened) -> None:
-        """Read the files of what is open with what was answered, and show them."""
-        session, self.upload.disabled = self._bindings.session, True
-        left = partial(session.jobs.superseded, LANE)
+        opened, session, self.upload.disabled = self._opened, self._bindings.session, True
         wait = "Another visitor's file is being read; yours is read after it."
+        unwanted = lambda: session.jobs.closed or not self.folder.visible  # noqa: E731
         try:
-            with turn(partial(session.say, wait, Severity.WARNING), lambda: session.jobs.closed):
-                known = opening.read(opened.files, opened.answers, session.robot, left)
-            self._see(replace(opened, recordings=known))
+            with turn(partial(session.say, wait, Severity.WARNING), unwanted):
+                known = opening.read(opened.files, opened.answers, session.robot, unwanted)
+            opening.preview(known, opened.choices, session.robot)
+        except DataError as error:
+            session.say(str(error), Severity.ALARM)
+            self._change(opened.files, files=opened.files[: opened.num_read])
+        else:
+            self._change(opened.files, recordings=known, num_read=len(opened.files))
+            session.jobs.submit(SEEING, self._see, latest=True)
         finally:
             self.upload.disabled = False
 
-    def _see(self, opened: Opened) -> None:
-        """Show what is open, at first without what the arm can reach; nothing if it was closed meanwhile."""
-        session, choices = self._bindings.session, opened.choices
-        seen = opening.preview(opened.recordings, choices, session.robot)
-        if not self.folder.visible:
-            return
-        self._opened, self._seen = opened, seen
-        if not choices.fits_reach:
-            self._draw()
-        self._seen = opening.with_reach(seen, choices, session.robot)
-        if self.folder.visible and (choices.fits_reach or self._seen is not seen):
-            self._draw()
+    def _change(self, of: tuple[tuple[str, bytes], ...], **changes: Any) -> None:  # noqa: ANN401 - fields of `Opened`
+        """Change what is open, unless other files are meanwhile."""
+        with self._changing:
+            if self._opened.files is of:
+                self._opened = replace(self._opened, **changes)
+
+    def _see(self) -> None:
+        """Show what is open, at first without what the arm can reach; nothing once it is changed or closed."""
+        opened, robot = self._opened, self._bindings.session.robot
+        if opened.recordings.takes:
+            seen = opening.preview(opened.recordings, opened.choices, robot)
+            if not opened.choices.fits_reach:
+                self._put(opened, seen)
+            self._put(opened, opening.with_reach(seen, opened.choices, robot))
+
+    def _put(self, opened: Opened, seen: Preview) -> None:
+        with self._changing:
+            if self._opened is opened and seen is not self._seen:
+                self._seen = seen
+                self._draw()
 
     def _choose(self, change: Callable[[Choices], Mapping[str, Any]]) -> None:
         """Have choices changed."""
-
-        def work() -> None:
-            opened = self._opened
-            if opened.recordings.takes:
-                self._see(replace(opened, choices=replace(opened.choices, **change(opened.choices))))
-
-        self._submit(work)
+        with self._changing:
+            choices = self._opened.choices
+            self._opened = replace(self._opened, choices=replace(choices, **change(choices)))
+        self._bindings.session.jobs.submit(SEEING, self._see, latest=True)
 
     def _answer(self, about: str, answer: Any) -> None:  # noqa: ANN401 - see `Question`
-        def work() -> None:
-            opened = self._opened
-            try:
-                self._read(replace(opened, answers={**opened.answers, about: answer}))
-            except DataError as error:
-                self._bindings.session.say(str(error), Severity.ALARM)
-
-        self._submit(work)
+        with self._changing:
+            self._opened = replace(self._opened, answers={**self._opened.answers, about: answer})
+        self._bindings.session.jobs.submit(LANE, self._read, latest=True)
 
     def _answer_axis(self, axis: str, column: str) -> None:
-        question = self._opened.recordings.questions.get("columns")
-        if question is not None:
-            self._answer("columns", {**question.answer, axis: column})
+        with self._changing:
+            question = self._opened.recordings.questions.get("columns")
+            if question is not None:
+                self._answer("columns", {**question.answer, **self._opened.answers.get("columns", {}), axis: column})
 
     @property
     def _number(self) -> int:
@@ -235,27 +238,30 @@ class OpenPanel:
         return options.index(value) if value in options else 0
 
     def _point(self, _title: str) -> None:
-        self._submit(self._draw)
+        with self._changing:
+            self._draw()
 
     def _leave_out(self, on: bool) -> None:
         number = frozenset([self._number])
         self._choose(lambda c: {"left_out": c.left_out - number if on else c.left_out | number})
 
     def _press(self) -> None:
-        seen = self._seen
-        if seen is not None and seen.task is not None:
-            self.close()
-            self._learn(self._bindings.session, seen.task)
+        with self._changing:
+            task = None if self._seen is None else self._seen.task
+            if task is not None:
+                self.close()
+                self._learn(self._bindings.session, task)
 
     # --- what is shown ---
 
     def _draw(self) -> None:
         """Show what is open."""
         seen, opened = self._seen, self._opened
+        self.controls["learn"].handle.disabled = seen is None or seen.task is None
         if seen is None:
             self.table.content = ""
-            for control in self.controls.values():
-                control.handle.visible = False
+            for name, control in self.controls.items():
+                control.handle.visible = control.handle.visible and name in ("open", "learn")
             return
         titles = tuple(f"{k} · {take.inspection.name}"[:40] for k, take in enumerate(seen.takes, 1))
         self._offer("take", titles, self.controls["take"].value)
@@ -282,7 +288,6 @@ class OpenPanel:
             choices = () if question is None else (NO_COLUMN, *question.choices)
             self._offer(axis, choices, "" if question is None else question.answer.get(axis, NO_COLUMN))
         self.table.content = seen_html(seen, number)
-        self.start.disabled = seen.task is None
         self._show(seen, number)
 
     def _offer(self, name: str, options: tuple[str, ...], value: str) -> None:
@@ -301,49 +306,3 @@ class OpenPanel:
 
 def _with(choices: Choices, name: str, on: bool) -> Any:  # noqa: ANN401 - PreparationSettings
     return replace(choices.preparation, **{name: on})
-
-
-def seen_html(seen: Preview, number: int) -> str:
-    """Return a table of what was found of each take, the chosen one marked, and what else is to be known."""
-    several = f"The takes end at {len(seen.goals)} places, none of them that of most: “Goal” chooses one."
-    alarms = [text for text in (seen.problem, seen.reach, several if seen.goals else "") if text]
-    told = [f"<div style='color:{ink(COLOURS[Severity.WARNING][0])}'>{html.escape(text)}</div>" for text in alarms]
-    told += [f"<div>{html.escape(note)}</div>" for note in seen.notes]
-    found = {finding.kind for take in seen.takes if take.learned is not None for finding in take.inspection.findings}
-    heads = [kind for kind in HEADS if kind in found]
-    rows = "".join(_row(k, take, heads, chosen=k == number) for k, take in enumerate(seen.takes))
-    titles = "".join(
-        f"<td style='text-align:right;opacity:0.65;padding-left:0.6em' title='{hint}'>{title}</td>"
-        for title, hint in (("s", "duration"), ("Hz", "samples a second"), *(HEADS[kind] for kind in heads))
-    )
-    table = f"<table style='width:100%;font-size:0.9em;white-space:nowrap'><tr><td></td>{titles}</tr>{rows}</table>"
-    return small("".join(told)) * bool(told) + small(f"<div style='max-height:21em;overflow:auto'>{table}</div>")
-
-
-def _row(number: int, take: SeenTake, heads: Sequence[FindingKind], *, chosen: bool) -> str:
-    """Return the row of a take: how large what was found is, or why it is left out; tooltips have all of it."""
-    own, left = take.inspection, take.learned is None
-    colour = LIGHT.stale if left else LIGHT.takes[number % len(LIGHT.takes)]
-    said = [f"{each.text}: {each.remedy or 'nothing is done'}" for each in own.findings]
-    said += ["out of the arm's reach"] * take.is_far + ["left out by you"] * (not take.is_chosen)
-    mark = f"display:inline-block;width:1.1em;border-top:0.28em {'dashed' if left else 'solid'} {css(colour)}"
-    cells = [("", f"{own.duration:.2f}", False), ("", f"{own.rate:.3g}", False)]
-    for kind in heads:
-        of_kind = [each for each in own.findings if each.kind == kind]
-        amounts = ", ".join(each.amount or "✓" for each in of_kind)
-        cells.append(("; ".join(each.text for each in of_kind), amounts, any(not each.remedy for each in of_kind)))
-    warned = f";font-weight:700;color:{ink(COLOURS[Severity.WARNING][0])}"
-    figures = "".join(
-        f"<td style='text-align:right;padding-left:0.6em{warned if is_left else ''}' title='{html.escape(title)}'>"
-        f"{html.escape(text)}</td>"
-        for title, text, is_left in (cells[:2] if left else cells)
-    )
-    why = html.escape(said[-1] if said else "left out")
-    far = f"<td style='{warned[1:]}'>out of reach</td>" if take.is_far else ""
-    reason = f"<td colspan='{len(heads)}' style='padding-left:0.6em;white-space:normal'>{why}</td>" if left else far
-    return (
-        f"<tr style='{'opacity:0.6' if left else ''}' title='{html.escape('; '.join(said))}'>"
-        f"<td style='font-weight:{700 if chosen else 400};max-width:8em;overflow:hidden;text-overflow:ellipsis'>"
-        f"<span style='{mark};vertical-align:0.2em;margin-right:0.4em'></span>{html.escape(own.name)}</td>"
-        f"{figures}{reason}</tr>"
-    )
