@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -60,6 +60,19 @@ class FormatError(ValueError):
 
     def __str__(self) -> str:
         return f"{self.field}: found {self.found}; accepted: {self.accepted}"
+
+
+class UnclearError(FormatError):
+    """Data of which something has to be asked, such as which columns are places.
+
+    Attributes:
+        question: "columns" (which of the choices are t, x, y, z), "reading" or "topic" (one of the choices).
+        choices: what may be answered.
+    """
+
+    def __init__(self, field: str, found: str, accepted: str, question: str, choices: Sequence[str]) -> None:
+        super().__init__(field, found, accepted)
+        self.question, self.choices = question, tuple(choices)
 
 
 def check_between(field: str, value: float, low: float, high: float) -> None:

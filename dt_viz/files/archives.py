@@ -15,10 +15,10 @@ import scipy.io
 
 from dt_viz.errors import FormatError
 from dt_viz.files.checks import check_at_most, check_size, real_numbers
-from dt_viz.files.columns import role_of
+from dt_viz.files.columns import is_place, role_of
 from dt_viz.files.npz import arrays_of
 from dt_viz.files.tables import LIMITS, ReadOptions, Table, imported
-from dt_viz.files.trees import tables_of
+from dt_viz.files.trees import complex_numbers, tables_of
 
 LASA_UNITS = {"length": 1e-3, "time": 1.0}
 """Units of the LASA handwriting data: millimetres and seconds."""
@@ -145,6 +145,8 @@ def read_hdf5(file: BinaryIO, source: Path, _options: ReadOptions) -> Iterator[T
                 size += item.size
                 check_at_most("file", size, LIMITS.numbers, "numbers")
                 tree[key] = item[()]
+            elif item.dtype.kind == "c" and item.ndim in (2, 3) and is_place(key):
+                raise complex_numbers(key)
         return tree
 
     with h5py.File(file, "r") as archive:

@@ -11,7 +11,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from dt_viz.errors import FormatError
+from dt_viz.errors import FormatError, UnclearError
 from dt_viz.files.checks import check_at_most
 from dt_viz.files.tables import LIMITS, ReadOptions, Table, imported
 
@@ -86,8 +86,10 @@ def _chosen(bag: Any, topic: str | None) -> tuple[list[Any], str | None]:  # noq
         return transforms, topic
     best = min(KINDS.index(_kind(connection)) for connection in usable)
     ranked = named or [connection for connection in usable if _rank(_kind(connection)) == _rank(KINDS[best])]
-    if len({connection.topic for connection in ranked}) > 1 and _kind(ranked[0]) not in TRANSFORMS:
-        raise FormatError("bag", f"poses or joint angles on the topics {listed}", "topic='…', one of them")
+    topics = list(dict.fromkeys(connection.topic for connection in ranked))
+    if len(topics) > 1 and _kind(ranked[0]) not in TRANSFORMS:
+        found = f"poses or joint angles on the topics {listed}"
+        raise UnclearError("bag", found, "topic='…', one of them", "topic", topics)
     return ranked, None
 
 
@@ -134,7 +136,7 @@ def _samples(messages: Iterator[tuple[int, Any]], frame: str | None, topic: str)
     moving = [name for name, samples in frames.items() if any(place != samples[0][1] for _, place in samples)]
     if frame is None and len(moving) != 1:
         found = f"{len(moving)} moving frames on {topic} ({', '.join(moving or frames)[:160]})"
-        raise FormatError("bag", found, "topic='…', the frame of the hand")
+        raise UnclearError("bag", found, "topic='…', the frame of the hand", "topic", moving or list(frames))
     return frames[frame or moving[0]]
 
 

@@ -13,7 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from dt_viz.errors import FormatError
+from dt_viz.errors import UnclearError
 
 UNITS: Mapping[str, tuple[str, float]] = {
     **{"m": ("length", 1.0), "cm": ("length", 1e-2), "mm": ("length", 1e-3)},
@@ -188,7 +188,12 @@ def expanded(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
     return {f"{before}{part}": values[:, k] for k, part in enumerate(parts)}
 
 
-def unnamed(values: np.ndarray, num_joints: int | None, *, rated: bool, timed: bool) -> list[str]:
+def numbered(width: int) -> list[str]:
+    """Name columns that have no names, for those who are asked what they are."""
+    return [f"column {k + 1}" for k in range(width)]
+
+
+def unnamed(values: np.ndarray, num_joints: int | None, *, rated: bool, timed: bool, asks: bool = False) -> list[str]:
     """Name the columns of a matrix (T, k) without names, as far as its numbers make them clear.
 
     Args:
@@ -196,16 +201,17 @@ def unnamed(values: np.ndarray, num_joints: int | None, *, rated: bool, timed: b
         num_joints: number of joints of the arm at hand.
         rated: whether the rate is known, so that no column has times.
         timed: whether two or three columns may begin with times.
+        asks: whether it is asked, rather than guessed, if the first of three has times.
 
     Raises:
-        FormatError: they are not clear.
+        UnclearError: they are not clear.
     """
     width = values.shape[1]
     pose = [*"xyz", "qx", "qy", "qz", "qw"]
     joints = [f"joint{k + 1}" for k in range(num_joints or 0)]
     even = not rated and _is_even(values[:, 0])
     if width in (2, 3):
-        return ["t", "x", "y"] if timed and width == 3 and even and not _is_even(values[:, 1]) else [*"xyz"[:width]]
+        return _few(width, timed=timed and even and width == 3 and not _is_even(values[:, 1]), asks=asks)
     if num_joints and width in (num_joints, num_joints + 1) and not _is_unit(values[:, -4:]):
         return joints if width == num_joints else ["t", *joints]
     if width == 4 and (even or (not rated and (np.diff(values[:, 0]) > 0).all())):
@@ -217,7 +223,16 @@ def unnamed(values: np.ndarray, num_joints: int | None, *, rated: bool, timed: b
     if width == 8 and _is_unit(values[:, 4:]):
         return ["t", *pose]
     accepted = "(T, 2) or (T, 3); else say what they are, such as columns='t,x,y,z' or columns='joint1,joint2,…'"
-    raise FormatError("columns", f"{width} columns without names", accepted)
+    raise UnclearError("columns", f"{width} columns without names", accepted, "columns", numbered(width))
+
+
+def _few(width: int, *, timed: bool, asks: bool) -> list[str]:
+    """Name two or three columns, the first of three times if it may be `timed`, or ask."""
+    if timed and asks:
+        readings = ("t,x,y", "x,y,z")
+        found, accepted = "three without names, of which the first may have times", " or ".join(readings)
+        raise UnclearError("columns", found, accepted, "reading", readings)
+    return ["t", "x", "y"] if timed else [*"xyz"[:width]]
 
 
 def _is_unit(values: np.ndarray) -> bool:
@@ -272,19 +287,19 @@ def layout(names: Sequence[str], others: Sequence[str] = ()) -> Layout:
     elif joints:
         positions = ()
     if not positions and not joints:
-        raise _unclear("no places", [*names, *others])
+        raise _unclear("no places", [*names, *others], names)
     first = {kind: next(iter(by_kind[kind]), "") for kind in ("label", "rate")}
     orientations = _orientation_columns(by_kind["orientation"], roles, group) if len(positions) == 3 else ()
     return Layout(time, fraction, first["label"], first["rate"], positions, orientations, joints)
 
 
-def _unclear(what: str, names: Sequence[str]) -> FormatError:
+def _unclear(what: str, names: Sequence[str], choices: Sequence[str]) -> UnclearError:
     found = f"{what} in {','.join(names)[:160]!r}"
     accepted = (
         "x, y and perhaps z, t, demo, or joint1, joint2, …, such as 't,x,y,z' or 'timestamp,pos_x,pos_y,pos_z'; "
         "or say which, such as columns={'x': 'name of x', 'y': 'name of y'}"
     )
-    return FormatError("columns", found, accepted)
+    return UnclearError("columns", found, accepted, "columns", choices)
 
 
 def _clock(names: Sequence[str], roles: Mapping[str, Role]) -> tuple[str, str]:
@@ -310,7 +325,7 @@ def _position_columns(
     best = {group: roles[axes["x"]].rank for group, axes in whole.items()}
     alike = [group for group in whole if best[group] == min(best.values())]
     if len(alike) > 1 and not set(alike[0]) & POSITIONS:
-        raise _unclear(f"{len(alike)} places ({', '.join(' '.join(group) for group in alike)[:80]})", given)
+        raise _unclear(f"{len(alike)} places ({', '.join(' '.join(group) for group in alike)[:80]})", given, given)
     return tuple(whole[alike[0]][axis] for axis in "xyz" if axis in whole[alike[0]]), alike[0]
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -80,10 +79,6 @@ def read_points(content: bytes, suffix: str) -> Answer:
         if array.dtype.kind not in "biuf":
             raise FormatError("points", f"values of type {array.dtype}", "integers or real numbers")
     return tuple(array.astype(np.float64) for array in columns), notes
-
-
-KINDS: Mapping[str, Callable[[bytes, str], Answer]] = {"mesh": read_mesh, "points": read_points}
-"""Readers by what is asked for."""
 
 
 def _check_text(content: bytes, suffix: str) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from dt_viz.errors import FormatError
 from dt_viz.files.checks import too_many
-from dt_viz.files.columns import role_of, unnamed
+from dt_viz.files.columns import numbered, role_of, unnamed
 
 
 @dataclass(frozen=True)
@@ -51,6 +51,8 @@ class ReadOptions:
     """Topic of a bag, or child frame of its transforms."""
     num_joints: int | None = None
     """Number of joints of the arm at hand."""
+    asks: bool = False
+    """Whether what is not clear is asked, of all columns, rather than guessed."""
 
     @property
     def names(self) -> list[str] | None:
@@ -119,7 +121,7 @@ def read_text(file: BinaryIO, source: Path, options: ReadOptions) -> Iterator[Ta
         raise FormatError("columns", f"{len(given)} names for {width} columns", f"{width} names")
     names = given or header
     lower = {name.lower() for name in options.roles.values()}
-    wanted = [not names or role_of(names[k]) is not None or names[k].lower() in lower for k in range(width)]
+    wanted = [not names or options.asks or role_of(names[k]) or names[k].lower() in lower for k in range(width)]
     labels: dict[str, float] = {}
     label = [bool(names) and _is_label(names[k], options) for k in range(width)]
     used = [
@@ -156,7 +158,8 @@ def read_text(file: BinaryIO, source: Path, options: ReadOptions) -> Iterator[Ta
 
     if not names:
         matrix = np.stack([rows[f"f{k}"] for k in used], axis=1)
-        names = unnamed(matrix, options.num_joints, rated=options.rate is not None, timed=True)
+        how = {"rated": options.rate is not None, "timed": True, "asks": options.asks}
+        names = numbered(width) if options.roles else unnamed(matrix, options.num_joints, **how)
     columns = {names[k]: rows[f"f{k}"] for k in used}
     unused = tuple(name for k, name in enumerate(names) if k not in used)
     yield Table(source.stem, columns, place, unused=unused, labels=tuple(labels))

@@ -14,7 +14,7 @@ from dt_viz.errors import FormatError
 from dt_viz.files.archives import read_hdf5, read_json, read_mat, read_npy, read_npz, read_parquet
 from dt_viz.files.bags import read_bag
 from dt_viz.files.checks import check_at_most, checked_suffix, real_numbers
-from dt_viz.files.columns import MAX_TURN, UNITS, Layout, expanded, is_kind, layout, role_of, unit_of, unnamed
+from dt_viz.files.columns import MAX_TURN, UNITS, Layout, expanded, is_kind, layout, numbered, role_of, unit_of, unnamed
 from dt_viz.files.tables import LIMITS, ReadOptions, Table, read_text
 
 UNTIMED = 5.0
@@ -45,6 +45,8 @@ class Take:
     """Describes the place of a sample in the file, for messages."""
     units: dict[str, float]
     """Sizes of the units of "length", "time" and "angle", as far as the file says."""
+    is_timed: bool = True
+    """Whether the file has its times or its rate."""
 
 
 Rows = slice | np.ndarray
@@ -126,6 +128,12 @@ def _split(table: Table, options: ReadOptions, notes: dict[str, None]) -> Iterat
     names = found.positions or found.joints
     length = len(columns[names[0]])
     times = _times(columns, found, options)
+    rate = _rate(columns, found, options) if times is None else None
+    is_timed = times is not None or rate is not None
+    if not is_timed:
+        notes[
+            f"no times and no rate: each demonstration takes {UNTIMED:g} s, evenly sampled; rate=… says otherwise"
+        ] = None
     groups = [("", slice(0, length))]
     if found.label and columns[found.label].shape == (length,):
         groups = _labelled(columns[found.label], table.labels)
@@ -138,14 +146,14 @@ def _split(table: Table, options: ReadOptions, notes: dict[str, None]) -> Iterat
         if turns is not None and (turns := _unit_quaternions(turns)) is None:
             unused = ", ".join(name for name in columns if name in found.orientations)
             notes[f"columns {unused} are not used: some of their quaternions have another length than 1"] = None
-        seconds = _even(len(values), columns, found, options, notes) if times is None else times
+        seconds = np.arange(len(values)) / (rate or max(len(values) - 1, 1) / UNTIMED) if times is None else times
         seconds = seconds[rows] if len(seconds) == length else seconds
         place = _placing(table.place, rows)
         if found.positions:
-            yield Take(name, seconds, values, turns, None, (), place, units)
+            yield Take(name, seconds, values, turns, None, (), place, units, is_timed)
         else:
             joint_names = tuple(joint.removeprefix("joint.") for joint in found.joints)
-            yield Take(name, seconds, None, None, values, joint_names, place, units)
+            yield Take(name, seconds, None, None, values, joint_names, place, units, is_timed)
 
 
 def _named_columns(table: Table, options: ReadOptions) -> dict[str, np.ndarray]:
@@ -156,14 +164,19 @@ def _named_columns(table: Table, options: ReadOptions) -> dict[str, np.ndarray]:
             columns |= expanded(name, values)
             continue
         rated = options.rate is not None or any(is_kind(other, "time") for other in table.columns)
-        names = options.names or unnamed(values, options.num_joints, rated=rated, timed=False)
+        names = options.names or (
+            numbered(values.shape[1])
+            if options.roles
+            else unnamed(values, options.num_joints, rated=rated, timed=False)
+        )
         if len(names) != values.shape[1]:
             raise FormatError("columns", f"{len(names)} names for {values.shape[1]} columns", "a name for each")
         columns |= {name: values[:, k] for k, name in enumerate(names)}
-    lower = {name.lower(): name for name in columns}
+    lower, taken = {name.lower(): name for name in columns}, {name.lower() for name in options.roles.values()}
     if missing := [name for name in options.roles.values() if name.lower() not in lower]:
         raise FormatError("columns", f"no {missing[0]!r} in {','.join(columns)[:160]!r}", "names of the file's columns")
-    chosen = {role: columns.pop(lower[name.lower()]) for role, name in options.roles.items()}
+    chosen = {role: columns[lower[name.lower()]] for role, name in options.roles.items()}
+    columns = {name: values for name, values in columns.items() if name.lower() not in taken}
     return chosen | {name: values for name, values in columns.items() if name not in chosen}
 
 
@@ -205,22 +218,15 @@ def _times(columns: Mapping[str, np.ndarray], found: Layout, options: ReadOption
     return times
 
 
-def _even(
-    num: int, columns: Mapping[str, np.ndarray], found: Layout, options: ReadOptions, notes: dict[str, None]
-) -> np.ndarray:
-    """Times of samples that have none: at the rate that is given or in the file, or `UNTIMED` seconds in all."""
+def _rate(columns: Mapping[str, np.ndarray], found: Layout, options: ReadOptions) -> float | None:
+    """Rate that is given or in the file, Hz."""
     rate = options.rate
     if rate is None and found.rate and columns[found.rate].size:
         rate = float(columns[found.rate].flat[0])
         role = role_of(found.rate)
         if rate and role is not None and role.group == ("dt",):
             rate = 1 / (rate * UNITS[role.unit or "s"][1])
-    if rate is None or not 0 < rate < np.inf:
-        rate = max(num - 1, 1) / UNTIMED
-        notes[
-            f"no times and no rate: each demonstration takes {UNTIMED:g} s, evenly sampled; rate=… says otherwise"
-        ] = None
-    return np.arange(num) / rate
+    return rate if rate is not None and 0 < rate < np.inf else None
 
 
 def _labelled(labels: np.ndarray, names: Sequence[str]) -> list[tuple[str, Rows]]:

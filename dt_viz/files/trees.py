@@ -100,6 +100,13 @@ def _tables(tree: Any, name: str) -> Iterator[Table]:  # noqa: ANN401 - condense
         yield from itertools.chain.from_iterable(takes)
     elif tree.dtype.kind in "iuf" and tree.ndim in (2, 3):
         yield from _several({"": _upright(tree, None)}, name)
+    elif tree.dtype.kind == "c" and tree.ndim in (2, 3):
+        raise complex_numbers(name)
+
+
+def complex_numbers(name: str) -> FormatError:
+    """Return the error about an array of this name that would be a take if its numbers were real."""
+    return FormatError(f"array {name[:40]!r}", "complex numbers", "real numbers")
 
 
 def _lettered(arrays: Mapping[str, np.ndarray]) -> bool:

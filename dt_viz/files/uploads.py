@@ -9,9 +9,11 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -33,11 +35,12 @@ class _Process:
         root = Path(__file__).parents[2]  # holds this package
         path = os.pathsep.join([str(root), *filter(None, sys.path)])
         threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+        self._folder = tempfile.TemporaryDirectory(prefix="dt-viz-")  # what a process leaves that is ended goes with it
         self._answer = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `end`; a pipe could be filled without end
         self._process = subprocess.Popen(
             [sys.executable, "-m", worker.__name__],
             cwd=root,  # where -m looks first
-            env=os.environ | threads | {"PYTHONPATH": path},
+            env=os.environ | threads | {"PYTHONPATH": path, "TMPDIR": self._folder.name},
             stdin=subprocess.PIPE,
             stdout=self._answer,
             stderr=subprocess.DEVNULL,
@@ -97,6 +100,7 @@ class _Process:
         with suppress(OSError):  # what it has not taken
             self._process.stdin.close()
         self._answer.close()
+        self._folder.cleanup()
 
 
 class _Ready:
@@ -134,14 +138,21 @@ class _Ready:
 _ready = _Ready()
 
 
-def read_upload(kind: str, suffix: str, content: bytes, cancelled: Cancelled = never) -> Read:
+def read_upload(
+    kind: str,
+    suffix: str,
+    content: bytes,
+    cancelled: Cancelled = never,
+    options: Mapping[str, Any] = MappingProxyType({}),
+) -> Read:
     """Read a file in another process.
 
     Args:
-        kind: "mesh" or "points".
+        kind: "mesh", "points" or "takes".
         suffix: the format, in lower case, such as ".stl".
         content: all bytes of the file.
         cancelled: whether nobody wants it any more.
+        options: further arguments of the reader.
 
     Returns:
         Arrays of which nothing is known but that no object is in them: vertices and faces, or points and perhaps
@@ -153,9 +164,14 @@ def read_upload(kind: str, suffix: str, content: bytes, cancelled: Cancelled = n
         Exception: of almost any kind, if the process gave another answer.
     """
     try:
-        return _ready.take().read((json.dumps([kind, suffix]).encode(), b"\n", content), cancelled)
+        return _ready.take().read((json.dumps([kind, suffix, dict(options)]).encode(), b"\n", content), cancelled)
     finally:
         _ready.renew()
+
+
+def make_ready() -> None:
+    """Start the process for a file that is about to come."""
+    _ready.renew()
 
 
 def keep_ready(user: object) -> None:

@@ -86,6 +86,8 @@ class Finding:
     """Predicate of a sentence about the take, such as "stands still for 1.2 s"."""
     remedy: str = ""
     """What is done about it, such as "the pause is cut"; empty where nothing is."""
+    amount: str = ""
+    """How large it is, such as "1.2 s"; empty where that is no size."""
 
 
 @dataclass(frozen=True)
@@ -139,13 +141,13 @@ class Repaired:
         self._moments = np.interp(moments, self.times, self._moments)
         self.times, self.positions = times - times[0], positions
 
-    def find(self, kind: FindingKind, text: str, remedy: str = "") -> None:
-        """Note a finding."""
-        self.findings.append(Finding(kind, text, remedy))
+    def find(self, kind: FindingKind, text: str, remedy: str = "", amount: str = "") -> None:
+        """Note a finding: text where the amount is put in for "{}", what is done about it, and the amount."""
+        self.findings.append(Finding(kind, text.format(amount), remedy, amount))
 
-    def leave_out(self, kind: FindingKind, text: str) -> None:
+    def leave_out(self, kind: FindingKind, text: str, amount: str = "") -> None:
         """Note why it is left out."""
-        self.find(kind, text, "it is left out")
+        self.find(kind, text, "it is left out", amount)
         self.kept = False
 
     @property
@@ -211,8 +213,9 @@ def _find_outliers(take: Repaired, settings: PreparationSettings) -> None:
     off[0] |= steps[0] > least > 2 * steps[1]
     off[-1] |= steps[-1] > least > 2 * steps[-2]
     if off.any() and (~off).sum() >= 2:
-        some = f"a sample up to {in_millimetres(steps.max())} off" if off.sum() == 1 else f"{off.sum()} samples far off"
-        take.find("outliers", f"has {some}", "left out" if settings.drop_outliers else "")
+        amount = in_millimetres(steps.max()) if off.sum() == 1 else f"{off.sum()}"
+        text = "has a sample up to {} off" if off.sum() == 1 else "has {} samples far off"
+        take.find("outliers", text, "left out" if settings.drop_outliers else "", amount)
         if settings.drop_outliers:
             take.replace(take.times[~off], take.positions[~off], take.times[~off])
 
@@ -242,7 +245,7 @@ def _gaps(take: Repaired, settings: PreparationSettings) -> tuple[Indices, Mask]
     if len(gaps):
         several = f", {len(gaps)} gaps" if len(gaps) > 1 else ""
         how = "a curve" if curved.all() else "a straight line" if not curved.any() else "curves and straight lines"
-        take.find("gap", f"has no samples for {intervals[gaps].max():.2g} s{several}", f"bridged by {how}")
+        take.find("gap", f"has no samples for {{}}{several}", f"bridged by {how}", f"{intervals[gaps].max():.2g} s")
     return gaps, curved
 
 
@@ -256,7 +259,7 @@ def _without_jitter(take: Repaired, grid: _Grid, settings: PreparationSettings) 
     if arc_length(take.positions)[-1] <= settings.jitter * arc_length(smooth)[-1]:
         return None
     take.jitter = noise
-    take.find("jitter", f"jitters by {in_millimetres(take.jitter)}", "smoothed" if settings.smooth_jitter else "")
+    take.find("jitter", "jitters by {}", "smoothed" if settings.smooth_jitter else "", in_millimetres(take.jitter))
     while cutoff * duration > 2:  # oscillations of the whole take
         smoother, more = grid.smoothed(cutoff / 1.5)
         left = 2.22 * cutoff * duration / len(take.times)  # part of the variance that passes, ∫ 1/(1 + (f/cutoff)⁴)
@@ -323,8 +326,8 @@ def _find_pauses(takes: Sequence[Repaired], settings: PreparationSettings) -> No
         cut = [pause[:2] for pause, kept in zip(pauses, usual, strict=True) if not kept and settings.cut_pauses]
         if pauses:
             remedy = "as most takes do: the pause is kept" if any(usual) else "the learned motion only slows down there"
-            text = f"stands still for {sum(last - first for first, last, _ in pauses):.2g} s"
-            take.find("pause", text, "the pause is cut" if cut else remedy)
+            amount = f"{sum(last - first for first, last, _ in pauses):.2g} s"
+            take.find("pause", "stands still for {}", "the pause is cut" if cut else remedy, amount)
         if cut:
             _cut(take, np.array(cut))
 

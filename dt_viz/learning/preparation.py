@@ -24,6 +24,18 @@ class ImitationError(ValueError):
     """Demonstrations from which no stable system can be learned; the message names the demonstration and the reason."""
 
 
+class NoCommonGoalError(ImitationError):
+    """Demonstrations that end at several places, none of them the place of most.
+
+    Attributes:
+        goals: for each place, what ends there and where, and the place (d,), metres; those of most takes first.
+    """
+
+    def __init__(self, message: str, goals: Sequence[tuple[str, tuple[float, ...]]]) -> None:
+        super().__init__(message)
+        self.goals = tuple(goals)
+
+
 class DemonstrationWarning(UserWarning):
     """Something odd about demonstrations, and what was done about it."""
 
@@ -190,23 +202,23 @@ def _common_goal(takes: Sequence[Repaired], spread: float, settings: Preparation
             around = np.linalg.norm(ends[:, None] - ends, axis=-1) <= reach
             near = around[around.sum(axis=1).argmax()]
         if 2 * near.sum() <= len(ends):
-            raise ImitationError(_no_common_goal(takes, ends, reach))
+            raise _no_common_goal(takes, ends, reach)
         goal = ends[near].mean(axis=0)
         if not settings.move_ends:
             goal = ends[np.linalg.norm(ends - goal, axis=1).argmin()]
     for take, end in zip(takes, ends, strict=True):
         off = float(np.linalg.norm(end - goal))
-        text = f"ends {in_millimetres(off)} from the {'common goal' if settings.goal is None else 'goal'}"
+        text, amount = f"ends {{}} from the {'common goal' if settings.goal is None else 'goal'}", in_millimetres(off)
         if off > reach and settings.leave_out:
-            take.leave_out("elsewhere", text)
+            take.leave_out("elsewhere", text, amount)
         elif 0 < off <= take.jitter and settings.move_ends:
             take.positions = _end_moved(take.positions, goal)
         elif off <= settings.same_goal * spread:
             continue
         elif not settings.move_ends:
-            take.leave_out("end", text)
+            take.leave_out("end", text, amount)
         else:
-            take.find("end", text, "its end is moved there")
+            take.find("end", text, "its end is moved there", amount)
     if not any(take.kept for take in takes):
         raise ImitationError("no demonstration ends at the goal; accepted: move_ends=True, which moves ends there")
     return goal
@@ -226,7 +238,7 @@ def _given_goal(given: Sequence[float], ends: Array, reach: float) -> Array:
     return goal
 
 
-def _no_common_goal(takes: Sequence[Repaired], ends: Array, reach: float) -> str:
+def _no_common_goal(takes: Sequence[Repaired], ends: Array, reach: float) -> NoCommonGoalError:
     """Say which takes end where, and how to choose."""
     left, groups = np.ones(len(ends), bool), []
     while left.any():
@@ -235,12 +247,14 @@ def _no_common_goal(takes: Sequence[Repaired], ends: Array, reach: float) -> str
         left[group] = False
         names = ", ".join(f"'{takes[k].demonstration.name}'" for k in group[:3])
         more = f" and {len(group) - 3} more" if len(group) > 3 else ""
-        groups.append(f"{names}{more} at {in_metres(ends[group].mean(axis=0))}")
+        goal = ends[group].mean(axis=0)
+        groups.append((f"{names}{more} at {in_metres(goal)}", tuple(goal.tolist())))
     several = f" and {len(groups) - 4} more places" if len(groups) > 4 else ""
-    return (
-        f"the demonstrations have no common goal, they end at {'; '.join(groups[:4])}{several}. "
+    message = (
+        f"the demonstrations have no common goal, they end at {'; '.join(text for text, _ in groups[:4])}{several}. "
         f"Choose one of these places as the goal (goal=…), or learn the takes of each place by themselves"
     )
+    return NoCommonGoalError(message, groups)
 
 
 def _lead_to_goal(take: Repaired, goal: Array, near: float) -> None:
@@ -252,7 +266,8 @@ def _lead_to_goal(take: Repaired, goal: Array, near: float) -> None:
     elif np.linalg.norm(path[0] - goal) <= near:
         first = away[0]
         text = "starts at the goal, where a stable motion ends"
-        take.find("start", text, f"its first {take.times[first]:.2g} s are left out")
+        amount = f"{take.times[first]:.2g} s"
+        take.find("start", text, f"its first {amount} are left out", amount)
         take.replace(take.times[first:], path[first:], take.times[first:])
 
 

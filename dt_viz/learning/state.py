@@ -74,7 +74,7 @@ def learn(
         labels: a number for each demonstration, which makes the state augmented; see `fit_augmented`.
         progress: see `dt_viz.learning.imitation.fit`.
         plain: gives the plain fit with these settings; None fits it here.
-        augmented: settings of the augmented state; None takes the defaults.
+        augmented: settings of the augmented state; None takes the defaults, with the preparation of the plain fit.
         choice: settings of the choice; None takes the defaults.
 
     Raises:
@@ -85,6 +85,7 @@ def learn(
     if state == "plain" and labels is not None:
         raise ImitationError("labels: found some; accepted: none in the plain state")
     settings, progress = settings or ImitationSettings(), progress or (lambda _fraction, _message: None)
+    augmented = augmented or AugmentedSettings(preparation=settings.preparation)
     given = plain or (lambda settings, progress: fit(demonstrations, settings, progress))
     if state == "plain":
         return given(settings, progress)
@@ -92,7 +93,7 @@ def learn(
         return fit_augmented(demonstrations, labels, augmented)
     if has_orientations(demonstrations):
         return fit_augmented(demonstrations, None, augmented, "the hand's orientation is learned, too")
-    choice, augmented = choice or ChoiceSettings(), augmented or AugmentedSettings()
+    choice = choice or ChoiceSettings()
     motions, found, begun = prepare(demonstrations, settings.preparation), None, 0.0
     if len(motions.numbers) >= choice.fewest:
         begun = choice.part

@@ -34,7 +34,8 @@ def motion_warnings(solved: Solved, drawn: DrawnSamples, robot: Robot | None = N
     """Why the motion that is drawn, of a robot or the hand alone, is not to be trusted."""
     nominal, scenario, stack, arm = solved.nominal, solved.scenario, solved.stack, solved.arm
     missed = float(np.linalg.norm(drawn.positions[-1] - nominal.goal))
-    warnings = [MotionWarning(Kind.IMITATION, text) for text in nominal.imitation.warnings]
+    found = [text for text in nominal.imitation.warnings if text not in nominal.task.seen]
+    warnings = [MotionWarning(Kind.IMITATION, text) for text in found]
     warnings += stack.warnings
     if max(len(stack.bundle.index), len(arm.index) if arm else 0) >= MAX_SAMPLES:
         text = "the motions are stretched too far to be sampled closely: what is drawn cuts corners"

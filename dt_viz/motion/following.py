@@ -275,6 +275,7 @@ class Follower:
             "reference_postures",
             (self.robot, learned),
             lambda: reference_postures(self.robot, usual, learned.task.starts, _mean(paths), _turns(learned)),
+            newest=NUM_POSTURES,
         )
 
     def out_of_reach(self, nominal: Nominal) -> Mask:

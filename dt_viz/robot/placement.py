@@ -75,16 +75,25 @@ def place(
     Raises:
         UnreachableError: No place fits, at the scale that is wanted; it says which one would.
     """
-    sampled = np.array([_resampled(path, settings.num_samples) for path in paths])
-    first = robot.size if scale is None else scale
+    sampled = np.array([resampled(path, settings.num_samples) for path in paths])
+    placement = fitting(robot, sampled, robot.size if scale is None else scale, settings)
+    if scale is not None and placement.scale < scale:
+        way_out = f"the largest scale that fits is about {placement.scale:.2g}"
+        raise UnreachableError(f"{robot.title} cannot follow the task at the scale {scale:.3g}: {way_out}")
+    return placement
+
+
+def fitting(robot: Robot, paths: Array, scale: float, settings: PlacementSettings = PlacementSettings()) -> Placement:
+    """Find where an arm follows paths (R, T, 3), metres, at the largest scale up to a given one; see `place`.
+
+    Raises:
+        UnreachableError: no place fits.
+    """
     for part in settings.scales:
-        for placement in _candidates(robot, sampled, part * first, settings):
-            if follows(robot, placement(sampled), settings):
-                if scale is not None and part < 1:
-                    way_out = f"the largest scale that fits is about {placement.scale:.2g}"
-                    raise UnreachableError(f"{robot.title} cannot follow the task at the scale {scale:.3g}: {way_out}")
+        for placement in _candidates(robot, paths, part * scale, settings):
+            if follows(robot, placement(paths), settings):
                 return placement
-    least = settings.scales[-1] * first
+    least = settings.scales[-1] * scale
     raise UnreachableError(f"{robot.title} cannot follow the task anywhere ahead of it, even at the scale {least:.2g}")
 
 
@@ -117,6 +126,6 @@ def _candidates(robot: Robot, paths: Array, scale: float, settings: PlacementSet
         yield Placement(scale, (float(x), float(y), float(z)))
 
 
-def _resampled(path: Array, num: int) -> Array:
+def resampled(path: Array, num: int) -> Array:
     """Take samples (num, 3) of a path (T, 3)."""
     return np.asarray(path, dtype=float)[np.linspace(0, len(path) - 1, num).round().astype(int)]

@@ -13,6 +13,7 @@ import numpy as np
 from dt_viz.flows.fields import Array
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.demonstrations import Demonstration, DemonstrationError, lasa_files, load_demonstrations
+from dt_viz.learning.inspection import PreparationSettings
 from dt_viz.learning.interface import AnyImitation, State
 from dt_viz.metrics import resample_by_arc_length
 from dt_viz.numerics import unit
@@ -69,6 +70,10 @@ class Task:
     """State that it is learned in where none is asked for."""
     draws: bool = False
     """Whether the hand holds a pen and draws on the slice."""
+    preparation: PreparationSettings = field(default_factory=PreparationSettings)
+    """Settings of what is done to the demonstrations before they are learned."""
+    seen: tuple[str, ...] = ()
+    """What was found about the demonstrations and shown before they were learned: it is no warning any more."""
 
     def to_world(self, points: Array) -> Array:
         """Transform points (*B, k) of the demonstrations to the world, (*B, 3), metres."""

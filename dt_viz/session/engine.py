@@ -11,6 +11,7 @@ from dt_viz.avoidance.avoidance import Avoidance
 from dt_viz.errors import Cancelled, never
 from dt_viz.learning.augmented import AugmentedImitation, fit_augmented
 from dt_viz.learning.imitation import ImitationSettings, Progress
+from dt_viz.learning.patterns import AugmentedSettings
 from dt_viz.learning.store import FitStore
 from dt_viz.learning.style import Style
 from dt_viz.memo import Memo, kept
@@ -24,7 +25,7 @@ from dt_viz.robot.inverse_kinematics import UnreachableError
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.panels import Panel
 from dt_viz.scenario.scenario import Layer, Scenario, Start
-from dt_viz.scenario.tasks import STYLES, Task, TaskEntry
+from dt_viz.scenario.tasks import OWN, STYLES, Task, TaskEntry
 from dt_viz.session.certify import certify, clearance, uncertified, with_meshes
 from dt_viz.session.comparison import Comparison
 from dt_viz.session.cores import Cores
@@ -32,6 +33,9 @@ from dt_viz.session.drawing import Drawing, arm_along, rollouts_of
 from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.robot_loop import LiveArm
 from dt_viz.warning import MotionWarning
+
+MOST_OWN = 4
+"""Largest number of a visitor's own tasks that are kept; the oldest go first."""
 
 _cores = Cores()
 """Slots of all engines."""
@@ -67,14 +71,35 @@ class Engine:
         self._drawing = Drawing(self.follower, self.memo)
         self._last: dict[str, Solved] = {}
         """The last motion of each task: what is shown where a scenario has none."""
+        self.own: dict[str, tuple[Task, FitStore]] = {}
+        """The visitor's own tasks by name, the oldest first, and what was learned from each: nobody else sees them."""
 
     def task(self, name: str) -> Task:
-        """The task of that name, which all engines share; any thread may ask for it.
+        """The task of that name, which all engines share but for a visitor's own; any thread may ask for it.
 
         Raises:
             DemonstrationError: its file cannot be used.
         """
-        return self._tasks[name]()
+        return self.own[name][0] if name in self.own else self._tasks[name]()
+
+    def bring(self, task: Task, shown: str) -> tuple[Task, str | None]:
+        """Take a task of the visitor's own.
+
+        Args:
+            task: the task.
+            shown: name of the task that is shown now, which stays.
+
+        Returns:
+            The task with a name and a title of its own, and the name of the own task that had to go, if one had.
+        """
+        number = max((int(name.rpartition("_")[2]) for name in self.own), default=0) + 1
+        task = replace(task, name=f"{OWN}_{number}", title=f"Your data {number}" if number > 1 else "Your data")
+        oldest = next((name for name in self.own if name != shown), None) if len(self.own) >= MOST_OWN else None
+        own = {name: kept for name, kept in self.own.items() if name != oldest}
+        self.own = own | {task.name: (task, FitStore(None))}  # at once: others read it
+        if oldest is not None:
+            self._last.pop(oldest, None)
+        return task, oldest
 
     def frames(
         self, scenario: Scenario, progress: Progress | None = None, cancelled: Cancelled = never
@@ -130,12 +155,24 @@ class Engine:
     def _added(self, learned: Learned, start: Start) -> NominalTrajectory:
         return learned.trajectory(start)  # one that is dragged leaves nothing behind
 
-    @kept(by=lambda scenario, _: scenario.learned, of="_shared")
     def _learned(self, scenario: Scenario, progress: Progress | None) -> Learned:
+        learned = self._learned_own if scenario.task in self.own else self._learned_shared
+        return learned(scenario, progress)
+
+    @kept(by=lambda scenario, _: scenario.learned, of="_shared")
+    def _learned_shared(self, scenario: Scenario, progress: Progress | None) -> Learned:
+        return self._learn(scenario, self._fits, progress)
+
+    @kept(MOST_OWN, by=lambda scenario, _: scenario.learned)
+    def _learned_own(self, scenario: Scenario, progress: Progress | None) -> Learned:
+        return self._learn(scenario, self.own[scenario.task][1], progress)
+
+    def _learn(self, scenario: Scenario, fits: FitStore, progress: Progress | None) -> Learned:
         task = self.task(scenario.task)
         state = task.state if scenario.state == "auto" else scenario.state
         state = state if scenario.imitation else "plain"  # without it there is nothing to remember
-        imitation = self._fits.learned(task.demonstrations, ImitationSettings(scenario.objective), state, progress)
+        settings = ImitationSettings(scenario.objective, preparation=task.preparation)
+        imitation = fits.learned(task.demonstrations, settings, state, progress)
         if imitation.state == "augmented" and scenario.state == "auto" and not imitation.reason:
             imitation = replace(imitation, reason="the plain state misses a demonstration of this task")
         return Learned.of(task, imitation, imitates=scenario.imitation)
@@ -143,7 +180,8 @@ class Engine:
     @kept(NEWEST, by=lambda task: task)
     def _augmented(self, task: str) -> AugmentedImitation:
         """The augmented imitation of a task's demonstrations."""
-        return fit_augmented(self.task(task).demonstrations)
+        of = self.task(task)
+        return fit_augmented(of.demonstrations, settings=AugmentedSettings(preparation=of.preparation))
 
     @kept(NEWEST, by=lambda scenario: scenario.learned)
     def _styled(self, scenario: Scenario) -> Learned:

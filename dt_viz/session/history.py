@@ -64,6 +64,13 @@ class History:
                 return steps.pop()
         return shown
 
+    def forget(self, task: str) -> None:
+        """Forget the scenarios of a task that is gone."""
+        for steps in (self._past, self._future):
+            left = [scenario for scenario in steps if scenario.task != task]
+            steps.clear()
+            steps.extend(left)
+
     def _moved(
         self, present: Scenario, source: deque[Scenario] | list[Scenario], target: deque[Scenario] | list[Scenario]
     ) -> Scenario | None:

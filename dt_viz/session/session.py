@@ -143,6 +143,14 @@ class Session:
             stack, view = as_fresh(self.scenario, fresh), replace(self.scenario.view, slice=None)
             self.step("task", task=name, arm_rollout=0, starts=fresh.starts, stack=stack, view=view)
 
+    def bring(self, task: Task) -> tuple[Task, str | None]:
+        """Take a task of the visitor's own, to be chosen; see `Engine.bring`."""
+        own, gone = self._engine.bring(task, self.scenario.task)
+        if gone is not None:
+            with self._lock:
+                self._history.forget(gone)
+        return own, gone
+
     def reset(self) -> None:
         """Back to how the task or the scene began, and was looked at; the motion's part of it can be undone."""
         scene = SCENES.get(self.scenario.scene)

@@ -25,6 +25,7 @@ from dt_viz.ui.scene.palette import Colour
 from dt_viz.ui.tabs.about import Command, add_about, add_commands, numbered
 from dt_viz.ui.tabs.arm import add_arm, play_or_pause
 from dt_viz.ui.tabs.compare import ComparePanel
+from dt_viz.ui.tabs.opening import OpenPanel, Show
 from dt_viz.ui.tabs.picture import BigType, PictureTab, Presentation
 from dt_viz.ui.tabs.show import ShowTab
 from dt_viz.ui.tabs.stack import StackPanel
@@ -33,6 +34,8 @@ from dt_viz.ui.tabs.world import add_obstacles, add_starts, add_transforms
 
 LANE = "task"
 """Lane of the session's jobs on which the task or scene that was chosen last is read."""
+MAX_UPLOAD = 50 * 10**6
+"""Largest number of bytes of what a visitor sends."""
 NO_SCENE = "–"
 OFF = "Off"
 SPACES: Mapping[str, Space] = {"Hand": "task", "Arm": "cspace"}
@@ -51,6 +54,7 @@ class ControlPanel:
         notify: Callable[[str, Colour], None],
         tripod: CameraController,
         darken: Callable[[bool], None],
+        preview: Show = lambda _seen, _number: None,
     ) -> None:
         """Build the controls; they act once `connect` has given them a session.
 
@@ -62,6 +66,7 @@ class ControlPanel:
             notify: shows a text in a colour beside the panel, however far that is scrolled.
             tripod: stand of the visitor's camera.
             darken: begins the dark theme, or the light one.
+            preview: shows takes that are open in the scene.
         """
         self._notify, self._tripod, self._titles = notify, tripod, dict(titles)
         self._notified: Message | None = None
@@ -70,7 +75,7 @@ class ControlPanel:
         self.presentation = Presentation(gui, self._turn, lambda alone: tripod.reframe(alone=alone))
         bindings.show(self._title, self.presentation.entitle)
         big = BigType(gui, tripod)
-        self._add_choices(gui)
+        self._add_choices(gui, preview)
         self.hint = gui.add_html(hint_html(""))
         add_avoid_and_imitate(gui, bindings)
         self.status = StatusLine(gui, bindings)
@@ -131,18 +136,30 @@ class ControlPanel:
         self.hint.content = hint_html(text)
         self.presentation.caption(text)
 
-    def _add_choices(self, gui: viser.GuiApi) -> None:
-        names = {title: name for name, title in self._titles.items()}
-        self.bindings.choice(
-            gui.add_dropdown("Task", tuple(names), hint="what is learned from demonstrations"),
-            lambda s: self._titles[s.task],
-            partial(self.begin, lambda session, title: session.choose_task(names[title])),
-        )
+    def _add_choices(self, gui: viser.GuiApi, preview: Show) -> None:
+        def choose(session: Session, title: str) -> None:
+            session.choose_task(next(name for name in self._titles if self._titles[name] == title))
+
+        tasks = gui.add_dropdown("Task", tuple(self._titles.values()), hint="what is learned from demonstrations")
+        self.bindings.properties(tasks, options=lambda _: tuple(self._titles.values()))
+        self.bindings.choice(tasks, lambda s: self._titles[s.task], partial(self.begin, choose))
+        OpenPanel(gui, self.bindings, preview, self._learn, MAX_UPLOAD)
         self.bindings.choice(
             gui.add_dropdown("Scene", (NO_SCENE, *self._scenes), hint="scenes of the paper's figures"),
             lambda s: SCENES[s.scene].title if s.scene in SCENES else NO_SCENE,
             partial(self.begin, self._load),
         )
+
+    def _learn(self, session: Session, task: Task) -> None:
+        """Begin with a task of the visitor's own."""
+
+        def begin(session: Session, _title: str) -> None:
+            own, gone = session.bring(task)
+            kept = {name: title for name, title in self._titles.items() if name != gone}
+            self._titles = kept | {own.name: own.title}
+            session.choose_task(own.name)
+
+        self.begin(begin, session, task.title)
 
     def _title(self, scenario: Scenario) -> str:
         return SCENES[scenario.scene].title if scenario.scene in SCENES else self._titles[scenario.task]

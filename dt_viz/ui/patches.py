@@ -85,6 +85,11 @@ def client_of(server: viser.ViserServer, connection: Any) -> viser.ClientHandle 
     return server.get_clients().get(ids[0]) if ids else None
 
 
+def name_of(handle: Any) -> str:  # noqa: ANN401
+    """Return the name of a control in the page. Hook: `handle.uuid`."""
+    return handle._impl.uuid
+
+
 def drop_uploads(client: viser.ClientHandle) -> None:
     """Let go of files that a client has not sent to the end. Hook: a limit of uploads that are under way."""
     client.gui._drop_uploads_from_client(client._websock_connection.client_id)  # pyright: ignore[reportArgumentType]

@@ -14,12 +14,12 @@ import viser
 
 from dt_viz.learning.store import FitStore
 from dt_viz.memo import Memo
-from dt_viz.obstacles.files import MAX_BYTES
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.tasks import TaskEntry
 from dt_viz.session.engine import Engine
 from dt_viz.ui.gate import Gate, Limits
 from dt_viz.ui.origins import Origin, Origins
+from dt_viz.ui.panel import MAX_UPLOAD
 from dt_viz.ui.tabs.status import COLOURS
 from dt_viz.ui.visitor import Visitor, notify
 from dt_viz.warning import Severity
@@ -83,7 +83,7 @@ class Server:
         """Number of pages that are being built, also for visitors who have left meanwhile."""
         self._closed = False
         self.gate = Gate(
-            Origins(host, allowed), Limits(max_sessions + max_waiting, upload=MAX_BYTES), _refuse, self._measured
+            Origins(host, allowed), Limits(max_sessions + max_waiting, upload=MAX_UPLOAD), _refuse, self._measured
         )
         self._server = self.gate.open(host, port, "DT-Viz")
         if self._server.get_port() != port:  # another program was faster than the check

@@ -17,6 +17,7 @@ from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import with_avoidance
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Frame, Stage
+from dt_viz.session.opening import Preview
 from dt_viz.session.progress import Display, Pace, Progress
 from dt_viz.session.session import Session
 from dt_viz.ui.controls import on_press
@@ -60,6 +61,8 @@ class Visitor(Display):
         self.client = client
         self.shown: Frame | None = None
         """The last drawn frame."""
+        self._previews = False
+        """Whether takes are seen that are not learned yet."""
         self._dress(LIGHT)
         client.gui.set_panel_label("DT-Viz")
         with client.atomic():
@@ -67,7 +70,14 @@ class Visitor(Display):
             self.robot = RobotScene(client, robot, Playback(engine.arm, self._pose))
         self._camera = CameraController(client, lambda: self.robot.hand, robot.size)
         self._panel = ControlPanel(
-            client.gui, titles, robot, self._save_png, partial(notify, client), self._camera, self._darken
+            client.gui,
+            titles,
+            robot,
+            self._save_png,
+            partial(notify, client),
+            self._camera,
+            self._darken,
+            self._preview,
         )
         self.session = Session(engine, lambda name: initial_scenario(engine, name), task, self)
         self._panel.connect(self.session)
@@ -111,6 +121,19 @@ class Visitor(Display):
         """Stop all work: the visitor has left."""
         let_go(self)
         self.session.close()
+
+    def _preview(self, seen: Preview | None, number: int) -> None:
+        """Show takes that are not learned yet in place of the motion; None ends it."""
+        begins, before = seen is not None, self._previews
+        self._previews = begins
+        with self.client.atomic():
+            self.pictures.preview(seen, number)
+            self.robot.set_aside(begins)
+        if seen is not None and seen.task is not None and not before:
+            self._camera.look(seen.task)
+        elif seen is None and self.shown is not None:
+            self._camera.look(self.shown.task, tuple(panel.shown for panel in self.shown.pictures.panels))
+        self.client.flush()
 
     def _pose(self) -> None:
         """Draw the scene a moment later."""

@@ -94,6 +94,8 @@ class Theme:
         (0, 140, 150),
     )
     """Motions of methods beside ours, in the order of the tables: after the muted set of Tol."""
+    takes: tuple[Colour, ...] = (level, bias, goal, rollout, obstacle, demonstration, (120, 94, 200))
+    """Takes that are seen before they are learned; those of more begin again."""
     brand: Colour = (0, 114, 178)
 
     @cached_property

@@ -33,6 +33,8 @@ class RobotScene:
         self.path = HandPath(scene)
         self.grip = Grip(scene, robot, node, lambda: self.hand, self._hold)
         self._view, self._theme = View(), LIGHT
+        self._aside = False
+        """Whether what the arm is about to do is not shown."""
         self._posed: tuple[bytes, bool] | None = None
         """The posture that was drawn last, and whether with that without avoidance."""
 
@@ -58,7 +60,18 @@ class RobotScene:
         if frame.stage is not Stage.ROLLOUTS:
             self.playback.replay.motion = frame.arm
             self.grip.draw(frame, look)
-            self.grip.visible = not self._view.replay
+            self._show_way()
+
+    def set_aside(self, aside: bool) -> None:
+        """Hide the way, the grip and what is carried, or show them again."""
+        self._aside = aside
+        self._show_way()
+
+    def _show_way(self) -> None:
+        view = self._view
+        self.carried.show(arm=view.arm and not self._aside)
+        self.path.visible = view.arm and not view.replay and not self._aside
+        self.grip.visible = not view.replay and not self._aside
 
     def adopt(self, view: View, look: Look) -> None:
         """Show and hide what a view says, beside a frame that was drawn with a look."""
@@ -66,9 +79,7 @@ class RobotScene:
         arm.stale = view.replay and (arm.stale or look.blocked)
         self.arms.show(view)
         self.their_arm.show(bool(view.their_arm))
-        self.carried.show(arm=view.arm)
-        self.path.visible = view.arm and not view.replay
-        self.grip.visible = not view.replay
+        self._show_way()
         if view.replay:  # a drag of the ball ends without an event
             self.playback.live.release()
             self.path.forget()

@@ -15,6 +15,7 @@ from dt_viz.robot.robot import Robot
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import anchored
 from dt_viz.session.frame import Frame
+from dt_viz.session.opening import Preview
 from dt_viz.session.session import Session
 from dt_viz.ui.scene.arm import ArmSequence
 from dt_viz.ui.scene.bias_points import BiasPoints
@@ -29,6 +30,7 @@ from dt_viz.ui.scene.slice_layers import ColourSlice, FieldArrows, Generator, Oc
 from dt_viz.ui.scene.stage import Stage
 from dt_viz.ui.scene.starts import Starts
 from dt_viz.ui.scene.style import STYLES
+from dt_viz.ui.scene.takes import Takes
 from dt_viz.ui.scene.tubes import RolloutTubes
 
 GOAL, OLD_GOAL = "goal", "demonstrated goal"
@@ -98,6 +100,7 @@ class ScenePictures:
             "lyapunov": function,
             "occupancy": OccupancySlice(scene),
         }
+        self._takes = Takes(scene)
         self._showing = threading.Lock()  # views change on another thread than the one that draws
         self._drawing = threading.Lock()
         self._frame: Frame | None = None
@@ -138,6 +141,15 @@ class ScenePictures:
             cast(Stage, self._by_view["table"]).paint(theme)
             self._redraw()
 
+    def preview(self, seen: Preview | None, number: int) -> None:
+        """Show takes in place of the motions, with the name of one of them; None ends it."""
+        if seen is not None:
+            self._takes.draw(seen, number, self._theme)
+        self._takes.visible = seen is not None
+        for picture in (*self.markers[:2], self.markers.starts, self._always[-1]):
+            picture.visible = seen is None
+        self._show()
+
     def _redraw(self) -> None:
         with self._drawing:
             if self._frame is not None:
@@ -169,9 +181,10 @@ class ScenePictures:
                 return
             view, look = self._adopted.view, self.look
             hidden = (OF_A_MOTION if look.blocked else set()) | (OF_A_TASK if look.stale else set())
+            hidden = set(self._by_view) - {"table"} if self._takes.visible else hidden
             for name, picture in self._by_view.items():
                 picture.visible = bool(getattr(view, name)) and name not in hidden
-            shown = None if look.blocked else self._by_colour.get(view.colour)
+            shown = None if look.blocked or self._takes.visible else self._by_colour.get(view.colour)
             for picture in self._by_colour.values():
                 picture.visible = picture is shown
 

@@ -71,6 +71,9 @@ class Styles:
     # lines
     demonstration: LineStyle = LineStyle("demonstration", 0.0018)
     ghost: LineStyle = LineStyle("ghost", 0.003, dash=0.012)
+    take: LineStyle = LineStyle("takes", 0.0042)
+    take_given: LineStyle = LineStyle("slice", 0.0012)
+    take_left_out: LineStyle = LineStyle("stale", 0.0026, dash=0.012)
     way: LineStyle = LineStyle("way", 0.0055)
     trail: LineStyle = LineStyle("way", 0.005)
     ink: LineStyle = LineStyle("ink", 0.005)

@@ -1,0 +1,242 @@
+"""A visitor's own recordings, seen before they are learned: what was found, what is done about it, and their task."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from dt_viz.errors import Cancelled, FormatError, never, parsing
+from dt_viz.files.columns import UNITS
+from dt_viz.files.recordings import Answers, Recordings, recordings_of, request
+from dt_viz.files.takes import UNTIMED, Take, in_si_units
+from dt_viz.files.uploads import read_upload
+from dt_viz.flows.fields import Array
+from dt_viz.learning.demonstrations import Demonstration, DemonstrationError, demonstrations_of
+from dt_viz.learning.inspection import Inspection, PreparationSettings
+from dt_viz.learning.preparation import ImitationError, Motions, NoCommonGoalError, prepare
+from dt_viz.robot.inverse_kinematics import UnreachableError
+from dt_viz.robot.placement import Placement, fitting, follows, resampled
+from dt_viz.robot.robot import Robot
+from dt_viz.scenario.tasks import OWN, Task, TaskEntry, own_task
+from dt_viz.session.tasks_in_reach import in_reach
+from dt_viz.warning import in_metres
+
+LENGTHS = tuple(unit for unit, (kind, _) in UNITS.items() if kind == "length")
+"""Units of positions that may be chosen."""
+USUAL_RATES = (5.0, 10.0, 20.0, 25.0, 30.0, 50.0, 60.0, 100.0, 125.0, 200.0, 240.0, 250.0, 500.0, 1000.0)
+"""Rates that recorders have, Hz; of takes without times the one is guessed with which they last about 5 s."""
+
+
+@dataclass(frozen=True)
+class Choices:
+    """What a visitor chooses about the takes that are open."""
+
+    unit: str = ""
+    """Unit of lengths, of `LENGTHS`, where files do not say it; empty where it is recognised."""
+    rate: float | None = None
+    """Samples a second of takes without times, Hz; None is guessed."""
+    left_out: frozenset[int] = frozenset()
+    """Numbers of takes that are left out by choice."""
+    goal: int = 0
+    """Number of the goal, where the takes have several."""
+    preparation: PreparationSettings = field(default_factory=PreparationSettings)
+    """What is done to takes."""
+    fits_reach: bool = False
+    """Whether the task is scaled and moved into the arm's reach where it is not in it."""
+
+
+@dataclass(frozen=True, eq=False)
+class SeenTake:
+    """One take, and what becomes of it."""
+
+    inspection: Inspection
+    given: Array
+    """(T, 3) positions as they were recorded, placed, metres."""
+    learned: Array | None
+    """(S, 3) positions that are learned from, placed, metres; None where it is left out."""
+    is_chosen: bool
+    """Whether the visitor has not left it out."""
+    is_far: bool = False
+    """Whether the arm cannot follow it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Preview:
+    """What would be learned of takes."""
+
+    takes: tuple[SeenTake, ...]
+    """All of them, in their order."""
+    task: Task | None = None
+    """The task of those that are learned from, placed; None where nothing can be learned."""
+    goal: Array | None = None
+    """(3,) its goal, metres."""
+    goals: tuple[str, ...] = ()
+    """The goals, if there are several: what ends there, and where."""
+    unit: str = ""
+    """Unit of lengths that is asked for; empty if it is clear."""
+    rate: float | None = None
+    """Rate that is asked for, Hz; None if the files say it."""
+    notes: tuple[str, ...] = ()
+    """What is to be known about the files, and about takes that cannot be used."""
+    reach: str = ""
+    """What is out of the arm's reach, and what would fit; empty if nothing is."""
+    problem: str = ""
+    """Why nothing can be learned."""
+
+
+def read(
+    files: Sequence[tuple[str, bytes]], answers: Answers, robot: Robot, cancelled: Cancelled = never
+) -> Recordings:
+    """Read files, each a name and its content, in another process.
+
+    Raises:
+        DemonstrationError: none of them can be read.
+        UnwantedError: nobody wants it any more.
+    """
+    name = files[0][0] if len(files) == 1 else f"{len(files)} files"
+    with parsing(DemonstrationError, name, "file", "recorded motions"):
+        content, options = request(files, answers, len(robot.joint_names))
+        arrays, _ = read_upload("takes", "recording", content, cancelled, options)
+        return recordings_of(arrays)
+
+
+def preview(recordings: Recordings, choices: Choices, robot: Robot) -> Preview:
+    """Inspect takes and place their task; `with_reach` asks the arm afterwards.
+
+    Raises:
+        DemonstrationError: no take can be used.
+    """
+    takes = [_copied(take) for take in recordings.takes]
+    rate = _rate(takes, choices)
+    if choices.unit:
+        takes = [replace(take, units={"length": UNITS[choices.unit][1]} | take.units) for take in takes]
+    is_open = any(take.positions is not None and "length" not in take.units for take in recordings.takes)
+    takes, note = in_si_units(takes, len(robot.joint_names))
+    used, refused = _usable(takes, robot)
+    recognised = next((unit for unit in LENGTHS if note.startswith(f"taken as in {unit} ")), "m")
+    wide = max(float(np.abs(own.positions).max()) for own in used) > robot.reach
+    unit = (choices.unit or recognised) if is_open and (note or choices.unit or wide) else ""
+    said = tuple(dict.fromkeys([*recordings.refused, *refused, *recordings.notes, *([note] if note else [])]))
+    return replace(_inspected(used, choices, robot), unit=unit, rate=rate, notes=said)
+
+
+def with_reach(seen: Preview, choices: Choices, robot: Robot) -> Preview:
+    """Say which takes the arm cannot follow, and at which scale it can; scale them so if that is chosen."""
+    if seen.task is None:
+        return seen
+    paths = [resampled(take.learned, 40) for take in seen.takes if take.learned is not None]
+    far = [not follows(robot, path[None]) for path in paths]
+    if not any(far):
+        return seen
+    is_far = iter(far)
+    takes = tuple(replace(take, is_far=take.learned is not None and next(is_far)) for take in seen.takes)
+    some = f"{sum(far)} of {len(far)} takes leave the reach of {robot.title}"
+    try:
+        fits = fitting(robot, np.array(paths), 1.0)
+    except UnreachableError as error:
+        return replace(seen, takes=takes, reach=f"{some}; {error}")
+    where = f"{fits.scale:.2g} × their size, moved by {in_metres(fits.shift)}"
+    if not choices.fits_reach:
+        return replace(seen, takes=takes, reach=f"{some}; the largest that fits is {where}")
+    return replace(_moved(seen, fits), reach=f"{some}; they are learned at {where}")
+
+
+def _moved(seen: Preview, fits: Placement) -> Preview:
+    assert seen.task is not None and seen.goal is not None
+    takes = tuple(
+        replace(take, given=fits(take.given), learned=None if take.learned is None else fits(take.learned))
+        for take in seen.takes
+    )
+    return replace(seen, takes=takes, task=seen.task.placed(fits.scale, fits.shift), goal=fits(seen.goal))
+
+
+def _copied(take: Take) -> Take:
+    """A take whose units may be changed in place."""
+    copies = {name: np.array(value) for name in ("positions", "joints") if (value := getattr(take, name)) is not None}
+    return replace(take, **copies)
+
+
+def _rate(takes: list[Take], choices: Choices) -> float | None:
+    """Rate of takes without times, which these are given; None where all have times."""
+    untimed = [k for k, take in enumerate(takes) if not take.is_timed]
+    if not untimed:
+        return None
+    usual = np.log(max(np.median([len(takes[k].times) for k in untimed]) - 1, 1) / UNTIMED)
+    rate = choices.rate or min(USUAL_RATES, key=lambda rate: abs(np.log(rate) - usual))
+    for k in untimed:
+        takes[k] = replace(takes[k], times=np.arange(len(takes[k].times)) / rate)
+    return rate
+
+
+def _usable(takes: Sequence[Take], robot: Robot) -> tuple[list[Demonstration], list[str]]:
+    """Demonstrations of the takes that are of the kind of most, and a line for each that cannot be used."""
+    used, refused = [], []
+    for take in takes:
+        try:
+            used.append((take.joints is None, *demonstrations_of([(Path(take.name), [take], ())], take.name, robot)))
+        except DemonstrationError as error:
+            refused.append(f"not used: {error}")
+    kinds = Counter((of_hand, own.dimension) for of_hand, own in used)
+    if not kinds:
+        first = refused[0] if refused else "no takes"
+        raise DemonstrationError("recordings", "takes", first, "at least one motion")
+    (kind, _), *_ = kinds.most_common(1)
+    words = {True: "places of the hand", False: "joint angles"}
+    for of_hand, own in used:
+        if (of_hand, own.dimension) != kind:
+            what = f"{words[of_hand]} of {own.dimension} coordinates"
+            accepted = f"{words[kind[0]]} of {kind[1]} coordinates, as in most takes"
+            refused.append(f"not used: {FormatError(repr(own.name), what, accepted)}")
+    return [own for of_hand, own in used if (of_hand, own.dimension) == kind], refused
+
+
+def _inspected(used: Sequence[Demonstration], choices: Choices, robot: Robot) -> Preview:
+    chosen = [k for k in range(len(used)) if k not in choices.left_out]
+    settings, goals, problem = choices.preparation, (), ""
+    found: dict[int, Inspection] = {}
+    numbers, motions = chosen, None
+    try:
+        try:
+            numbers, motions = _prepared(used, chosen, settings, found)
+        except NoCommonGoalError as error:
+            goals = tuple(text for text, _ in error.goals)
+            settings = replace(settings, goal=error.goals[min(choices.goal, len(goals) - 1)][1])
+            numbers, motions = _prepared(used, chosen, settings, found)
+    except ImitationError as error:
+        problem = str(error) if chosen else "Every take is left out; choose at least one."
+    kept = numbers if motions is not None else range(len(used))
+    given = replace(
+        own_task(tuple(used[k] for k in kept)), preparation=settings, seen=() if motions is None else motions.warnings
+    )
+    # drawings are placed; positions in space are where they are
+    entry = {OWN: TaskEntry(given.title, lambda: given)}
+    task = in_reach(entry, robot)[OWN]() if used[0].dimension == 2 else given
+    learned = {} if motions is None else dict(zip(numbers, motions.positions, strict=True))
+    takes = tuple(
+        SeenTake(
+            found.get(k) or Inspection(own.name, own.duration, len(own.times), kept=False),
+            task.to_world(own.positions),
+            task.to_world(learned[k]) if k in learned else None,
+            is_chosen=k not in choices.left_out,
+        )
+        for k, own in enumerate(used)
+    )
+    if motions is None:
+        return Preview(takes, goals=goals, problem=problem)
+    return Preview(takes, task, task.to_world(motions.goal), goals)
+
+
+def _prepared(
+    used: Sequence[Demonstration], numbers: list[int], settings: PreparationSettings, found: dict[int, Inspection]
+) -> tuple[list[int], Motions]:
+    """Prepare takes, again without those that are left out: what is seen is what is learned from. `found` gets all."""
+    while True:
+        motions = prepare([used[k] for k in numbers], settings)
+        found.update(zip(numbers, motions.inspections, strict=True))
+        if len(motions.numbers) == len(numbers):
+            return numbers, motions
+        numbers = [numbers[k] for k in motions.numbers]

@@ -1,0 +1,101 @@
+"""Several files at once, chosen or dropped, for an upload button of viser, which sends one.
+
+A script on the page packs them into one zip archive, without compression, and gives that to the button. Where scripts
+are not run, the button takes one file after another as it always does.
+"""
+
+from __future__ import annotations
+
+import html
+
+import viser
+
+from dt_viz.ui import patches
+
+SCRIPT = """
+const input = document.getElementById('file_upload_' + BUTTON);
+if (!input || input.multiple) return;
+const table = Array.from({length: 256}, (_, n) => {
+  for (let k = 0; k < 8; k++) n = n & 1 ? 0xEDB88320 ^ (n >>> 1) : n >>> 1;
+  return n >>> 0;
+});
+const crc32 = bytes => {
+  let value = ~0;
+  for (const byte of bytes) value = table[(value ^ byte) & 255] ^ (value >>> 8);
+  return ~value >>> 0;
+};
+const record = (...fields) => {
+  const view = new DataView(new ArrayBuffer(fields.reduce((sum, [size]) => sum + size, 0)));
+  let at = 0;
+  for (const [size, value] of fields) {
+    size === 2 ? view.setUint16(at, value, true) : view.setUint32(at, value, true);
+    at += size;
+  }
+  return view.buffer;
+};
+const packed = async files => {
+  const parts = [], central = [];
+  let at = 0, length = 0;
+  for (const [path, file] of files) {
+    const bytes = new Uint8Array(await file.arrayBuffer()), name = new TextEncoder().encode(path);
+    const size = bytes.length, common = [[2, 20], [2, 0x800], [2, 0], [2, 0], [2, 33], [4, crc32(bytes)], [4, size],
+      [4, size], [2, name.length], [2, 0]];
+    parts.push(record([4, 0x04034b50], ...common), name, bytes);
+    central.push(record([4, 0x02014b50], [2, 20], ...common, [2, 0], [2, 0], [2, 0], [4, 0], [4, at]), name);
+    at += 30 + name.length + size;
+    length += 46 + name.length;
+  }
+  const end = record([4, 0x06054b50], [2, 0], [2, 0], [2, files.length], [2, files.length], [4, length], [4, at],
+    [2, 0]);
+  return new File([...parts, ...central, end], files.length + ' files.zip');
+};
+const give = file => {
+  const transfer = new DataTransfer();
+  transfer.items.add(file);
+  input.files = transfer.files;
+  input.dispatchEvent(new Event('change', {bubbles: true}));
+};
+const send = async files => {
+  const large = files.find(([, file]) => file.size > MOST);
+  if (large || files.length === 1) give((large || files[0])[1]);
+  else if (files.length) give(await packed(files));
+};
+const within = async entry => {
+  if (entry.isFile) return [[entry.fullPath.slice(1), await new Promise((done, fail) => entry.file(done, fail))]];
+  const reader = entry.createReader(), found = [];
+  for (;;) {
+    const some = await new Promise((done, fail) => reader.readEntries(done, fail));
+    if (!some.length) return found;
+    for (const inner of some) found.push(...await within(inner));
+  }
+};
+input.multiple = true;
+input.addEventListener('change', event => {
+  if (input.files.length < 2) return;
+  event.stopPropagation();
+  send(Array.from(input.files, file => [file.name, file]));
+});
+const target = () => input.isConnected && !input.nextElementSibling?.disabled;
+const over = event => { if (target() && event.dataTransfer?.types.includes('Files')) event.preventDefault(); };
+const drop = async event => {
+  if (!target() || !event.dataTransfer?.files.length) return;
+  event.preventDefault();
+  const entries = Array.from(event.dataTransfer.items, item => item.webkitGetAsEntry()).filter(Boolean);
+  const files = Array.from(event.dataTransfer.files, file => [file.name, file]);
+  send(entries.length ? (await Promise.all(entries.map(within))).flat() : files);
+};
+window.dtVizForget?.();
+document.addEventListener('dragover', over);
+document.addEventListener('drop', drop);
+window.dtVizForget = () => {
+  document.removeEventListener('dragover', over);
+  document.removeEventListener('drop', drop);
+};
+"""
+"""What the page does: BUTTON is the button's name in it, MOST the largest number of bytes of a file."""
+
+
+def drop_html(button: viser.GuiUploadButtonHandle, most: int) -> str:
+    """Return what is to stand beside an upload button on the page, unseen; files are of so many bytes at most."""
+    script = SCRIPT.replace("BUTTON", repr(patches.name_of(button))).replace("MOST", str(most))
+    return f'<img src="data:," alt="" hidden onerror="{html.escape(f"(() => {{{script}}})()")}">'

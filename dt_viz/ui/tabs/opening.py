@@ -1,0 +1,308 @@
+"""The folder "Your data": recordings of a visitor's own, seen in the scene before they are learned."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import viser
+
+from dt_viz.errors import DataError
+from dt_viz.files.recordings import ARCHIVE, AXES, NO_COLUMN, Recordings
+from dt_viz.files.takes import READERS
+from dt_viz.files.uploads import make_ready
+from dt_viz.learning.inspection import FindingKind
+from dt_viz.scenario.tasks import Task
+from dt_viz.session import opening
+from dt_viz.session.opening import LENGTHS, USUAL_RATES, Choices, Preview
+from dt_viz.session.session import Session
+from dt_viz.ui.bindings import Bindings
+from dt_viz.ui.controls import Control, on_press
+from dt_viz.ui.dropping import drop_html
+from dt_viz.ui.scene.palette import LIGHT
+from dt_viz.ui.tabs.from_file import LANE, turn
+from dt_viz.ui.tabs.takes_table import seen_html
+from dt_viz.warning import Severity
+
+FORMATS = ", ".join(suffix[1:] for suffix in (*READERS, ARCHIVE))
+SWITCHES: Mapping[FindingKind, tuple[str, str, str]] = {
+    "units": ("convert_units", "Convert units", "of takes that seem to be in another unit than the others"),
+    "outliers": ("drop_outliers", "Drop outliers", "single samples far off"),
+    "gap": ("bridge_gaps", "Bridge gaps", "times without samples, by a curve; otherwise by a straight line"),
+    "jitter": ("smooth_jitter", "Smooth jitter", "faster trembling than a hand means to move"),
+    "pause": ("cut_pauses", "Cut pauses", "times in which a take stands still, and most others do not"),
+    "end": ("move_ends", "Move ends", "to the goal; otherwise takes that end beside it are left out"),
+    "elsewhere": (
+        "leave_out",
+        "One goal only",
+        "takes that end elsewhere are left out; otherwise their ends are moved",
+    ),
+}
+"""What is done about a kind of finding: the field of `PreparationSettings`, label and hint of its switch."""
+SEEING = "preview"
+"""Lane of the session's jobs on which what is open is inspected."""
+READINGS = {"t,x,y": "times", "x,y,z": "x, as the next ones are y and z"}
+"""What the first of three columns without names is, by the reading of all three."""
+
+
+@dataclass(frozen=True)
+class Opened:
+    """What a visitor has opened."""
+
+    files: tuple[tuple[str, bytes], ...] = ()
+    """Names and contents."""
+    answers: Mapping[str, Any] = field(default_factory=dict)
+    """What was answered to the files' questions, by what these are about."""
+    recordings: Recordings = field(default_factory=Recordings)
+    """What was read of the files."""
+    num_read: int = 0
+    """Number of files of which they were read."""
+    choices: Choices = field(default_factory=Choices)
+
+
+Show = Callable[[Preview | None, int], None]
+"""Function that shows a preview in the scene, and which take of it is chosen; None ends it."""
+
+
+class OpenPanel:
+    """The folder of one visitor's panel, and the button that opens it."""
+
+    def __init__(
+        self, gui: viser.GuiApi, bindings: Bindings, show: Show, learn: Callable[[Session, Task], None], most: int
+    ) -> None:
+        """Build the controls where the panel is being built.
+
+        Args:
+            gui: controls of the visitor.
+            bindings: bindings of the panel.
+            show: shows what is open in the scene.
+            learn: has a task learned.
+            most: largest number of bytes of all files.
+        """
+        self._bindings, self._show, self._learn, self._most = bindings, show, learn, most
+        self._changing = threading.RLock()  # one thread reads, another inspects, and handlers close what is open
+        self._opened = Opened()
+        self._seen: Preview | None = None
+        """What is shown of it."""
+        hint = f"recorded motions of your own: {FORMATS}"
+        begin = gui.add_button("Open your demonstrations", icon=viser.Icon.FOLDER_OPEN, hint=hint)
+        self.folder = gui.add_folder("Your data", visible=False)
+        with self.folder:
+            hint = f"{FORMATS}; several at once, one after another, or a zip of a folder"
+            self.upload = gui.add_upload_button("Choose files, or drop them here", icon=viser.Icon.UPLOAD, hint=hint)
+            gui.add_html(drop_html(self.upload, most))
+            self.table = gui.add_html("")
+            self.controls = self._add_controls(gui)
+            start = gui.add_button("Learn", icon=viser.Icon.SCHOOL, color=LIGHT.brand, disabled=True)
+            cancel = gui.add_button("Cancel", icon=viser.Icon.X, color="gray")
+        self.controls["open"] = Control(begin, lambda _pressed: self.open())
+        self.controls["learn"] = Control(start, lambda _pressed: self._press())
+        on_press(cancel, self.close)
+        bindings.show(lambda s: (s.task, s.scene), lambda _chosen: self.close())
+
+        @self.upload.on_upload
+        async def _(_event: viser.GuiEvent) -> None:
+            self.load(self.upload.value.name, self.upload.value.content)
+
+    def _add_controls(self, gui: viser.GuiApi) -> dict[str, Control]:
+        """Build what is shown only where it is asked for, by names of their own."""
+        at, found = self._choose, {}
+
+        def dropdown(name: str, label: str, options: tuple[str, ...], act: Callable[[str], Any], hint: str) -> None:
+            found[name] = Control(gui.add_dropdown(label, options, hint=hint, visible=False), act)
+
+        dropdown("take", "Take", (NO_COLUMN,), self._point, "the take that is named in the scene")
+        box = gui.add_checkbox("Use this take", True, visible=False)
+        found["chosen"] = Control(box, self._leave_out)
+        for kind, (name, label, hint) in SWITCHES.items():
+            box = gui.add_checkbox(label, True, hint=hint, visible=False)
+            found[kind] = Control(box, lambda on, name=name: at(lambda c: {"preparation": _with(c, name, on)}))
+        box = gui.add_checkbox("Scale to fit", False, hint="into the arm's reach", visible=False)
+        found["reach"] = Control(box, lambda on: at(lambda _: {"fits_reach": on}))
+        hint = "the place at which motions end; takes that end elsewhere are left out"
+        dropdown("goal", "Goal", ("1",), lambda goal: at(lambda _: {"goal": int(goal.split()[0]) - 1}), hint)
+        dropdown("unit", "Unit", LENGTHS, lambda unit: at(lambda _: {"unit": unit}), "of positions in files")
+        rates = tuple(f"{rate:g} Hz" for rate in USUAL_RATES)
+        hint = "samples a second of takes without times"
+        dropdown("rate", "Rate", rates, lambda text: at(lambda _: {"rate": float(text.split()[0])}), hint)
+        hint = "of three columns without names"
+        first = {label: reading for reading, label in READINGS.items()}
+        dropdown("reading", "First column", tuple(first), lambda label: self._answer("reading", first[label]), hint)
+        for axis in AXES:
+            hint = "the column with it"
+            answer = partial(self._answer_axis, axis)
+            dropdown(axis, f"Column of {'times' if axis == 't' else axis}", (NO_COLUMN,), answer, hint)
+        dropdown("topic", "Topic", (NO_COLUMN,), partial(self._answer, "topic"), "of the bag, or frame, of the hand")
+        return found
+
+    def open(self) -> None:
+        """Show the folder, and get ready for files."""
+        self.folder.visible, self.controls["open"].handle.visible = True, False
+        self._bindings.session.jobs.submit(LANE, make_ready)
+
+    def close(self) -> None:
+        """Let go of what is open, and show what was shown before. Nothing is done while nothing is open."""
+        with self._changing:
+            seen, self._seen, self._opened = self._seen, None, Opened()
+            self.folder.visible, self.controls["open"].handle.visible = False, True
+            self._draw()
+            if seen is not None:
+                self._show(None, 0)
+
+    def load(self, name: str, content: bytes) -> None:
+        """Have a file added to what is open; say why that cannot be. Nothing is done while the folder is hidden."""
+        session = self._bindings.session
+        if not self.folder.visible:
+            return
+        with self._changing:
+            files = (*self._opened.files, (name, content))
+            size = sum(len(each) for _, each in files)
+            if session.jobs.busy(LANE):
+                session.say("A file of yours is being read; open the next one after it.", Severity.WARNING)
+            elif size > self._most:
+                accepted = f"at most {self._most / 1e6:.0f} MB; the command line takes more"
+                session.say(f"{name}: files: found {size / 1e6:.1f} MB in all; accepted: {accepted}", Severity.ALARM)
+            else:
+                self._opened = replace(self._opened, files=files)
+                session.jobs.submit(LANE, self._read)
+
+    def _read(self) -> None:
+        """Read the files of what is open with what was answered; without the newest one if it cannot be read.
+
+        Raises:
+            UnwantedError: the visitor has left, or has closed what was open.
+        """
+        opened, session, self.upload.disabled = self._opened, self._bindings.session, True
+        wait = "Another visitor's file is being read; yours is read after it."
+        unwanted = lambda: session.jobs.closed or not self.folder.visible  # noqa: E731
+        try:
+            with turn(partial(session.say, wait, Severity.WARNING), unwanted):
+                known = opening.read(opened.files, opened.answers, session.robot, unwanted)
+            opening.preview(known, opened.choices, session.robot)
+        except DataError as error:
+            session.say(str(error), Severity.ALARM)
+            self._change(opened.files, files=opened.files[: opened.num_read])
+        else:
+            self._change(opened.files, recordings=known, num_read=len(opened.files))
+            session.jobs.submit(SEEING, self._see, latest=True)
+        finally:
+            self.upload.disabled = False
+
+    def _change(self, of: tuple[tuple[str, bytes], ...], **changes: Any) -> None:  # noqa: ANN401 - fields of `Opened`
+        """Change what is open, unless other files are meanwhile."""
+        with self._changing:
+            if self._opened.files is of:
+                self._opened = replace(self._opened, **changes)
+
+    def _see(self) -> None:
+        """Show what is open, at first without what the arm can reach; nothing once it is changed or closed."""
+        opened, robot = self._opened, self._bindings.session.robot
+        if opened.recordings.takes:
+            seen = opening.preview(opened.recordings, opened.choices, robot)
+            if not opened.choices.fits_reach:
+                self._put(opened, seen)
+            self._put(opened, opening.with_reach(seen, opened.choices, robot))
+
+    def _put(self, opened: Opened, seen: Preview) -> None:
+        with self._changing:
+            if self._opened is opened and seen is not self._seen:
+                self._seen = seen
+                self._draw()
+
+    def _choose(self, change: Callable[[Choices], Mapping[str, Any]]) -> None:
+        """Have choices changed."""
+        with self._changing:
+            choices = self._opened.choices
+            self._opened = replace(self._opened, choices=replace(choices, **change(choices)))
+        self._bindings.session.jobs.submit(SEEING, self._see, latest=True)
+
+    def _answer(self, about: str, answer: Any) -> None:  # noqa: ANN401 - see `Question`
+        with self._changing:
+            self._opened = replace(self._opened, answers={**self._opened.answers, about: answer})
+        self._bindings.session.jobs.submit(LANE, self._read, latest=True)
+
+    def _answer_axis(self, axis: str, column: str) -> None:
+        with self._changing:
+            question = self._opened.recordings.questions.get("columns")
+            if question is not None:
+                self._answer("columns", {**question.answer, **self._opened.answers.get("columns", {}), axis: column})
+
+    @property
+    def _number(self) -> int:
+        """Number of the take that is chosen."""
+        options = self.controls["take"].handle.options
+        value = self.controls["take"].value
+        return options.index(value) if value in options else 0
+
+    def _point(self, _title: str) -> None:
+        with self._changing:
+            self._draw()
+
+    def _leave_out(self, on: bool) -> None:
+        number = frozenset([self._number])
+        self._choose(lambda c: {"left_out": c.left_out - number if on else c.left_out | number})
+
+    def _press(self) -> None:
+        with self._changing:
+            task = None if self._seen is None else self._seen.task
+            if task is not None:
+                self.close()
+                self._learn(self._bindings.session, task)
+
+    # --- what is shown ---
+
+    def _draw(self) -> None:
+        """Show what is open."""
+        seen, opened = self._seen, self._opened
+        self.controls["learn"].handle.disabled = seen is None or seen.task is None
+        if seen is None:
+            self.table.content = ""
+            for name, control in self.controls.items():
+                control.handle.visible = control.handle.visible and name in ("open", "learn")
+            return
+        titles = tuple(f"{k} · {take.inspection.name}"[:40] for k, take in enumerate(seen.takes, 1))
+        self._offer("take", titles, self.controls["take"].value)
+        number, settings = self._number, opened.choices.preparation
+        self._turn("chosen", seen.takes[number].is_chosen, shown=True)
+        found = {finding.kind for take in seen.takes for finding in take.inspection.findings}
+        for kind, (name, *_) in SWITCHES.items():
+            on = bool(getattr(settings, name))
+            self._turn(kind, on, shown=kind in found or not on)
+        self._turn("reach", opened.choices.fits_reach, shown=bool(seen.reach))
+        goals = tuple(f"{k} · {text}"[:60] for k, text in enumerate(seen.goals, 1))
+        self._offer("goal", goals, goals[min(opened.choices.goal, len(goals) - 1)] if goals else "")
+        self._offer("unit", LENGTHS if seen.unit else (), seen.unit)
+        rates = tuple(f"{rate:g} Hz" for rate in USUAL_RATES)
+        self._offer("rate", rates if seen.rate else (), f"{seen.rate or 0:g} Hz")
+        questions = opened.recordings.questions
+        for about in ("reading", "topic"):
+            question = questions.get(about)
+            named = READINGS if about == "reading" else {}
+            choices = () if question is None else tuple(named.get(choice, choice) for choice in question.choices)
+            self._offer(about, choices, "" if question is None else named.get(question.answer, question.answer))
+        question = questions.get("columns")
+        for axis in AXES:
+            choices = () if question is None else (NO_COLUMN, *question.choices)
+            self._offer(axis, choices, "" if question is None else question.answer.get(axis, NO_COLUMN))
+        self.table.content = seen_html(seen, number)
+        self._show(seen, number)
+
+    def _offer(self, name: str, options: tuple[str, ...], value: str) -> None:
+        """Show a dropdown with options, if there are any."""
+        control = self.controls[name]
+        if options and control.handle.options != options:
+            control.handle.options = options
+        if options:
+            control.value = value if value in options else options[0]
+        control.handle.visible = bool(options)
+
+    def _turn(self, name: str, on: bool, *, shown: bool) -> None:
+        """Show a checkbox, or hide it."""
+        self.controls[name].value, self.controls[name].handle.visible = on, shown
+
+
+def _with(choices: Choices, name: str, on: bool) -> Any:  # noqa: ANN401 - PreparationSettings
+    return replace(choices.preparation, **{name: on})
