@@ -60,6 +60,8 @@ def place(
     paths: Sequence[Array],
     scale: float | None = None,
     settings: PlacementSettings = PlacementSettings(),
+    *,
+    on_table: bool = False,
 ) -> Placement:
     """Find where an arm follows the paths of a task that was made for the JACO, or for an arm of its size.
 
@@ -71,6 +73,7 @@ def place(
         paths: (T, 3) positions of the hand on each, metres, with the arm's front at −y.
         scale: the scale that is wanted; None takes the largest that fits, up to that of the arm's reach.
         settings: what is tried.
+        on_table: whether heights above the table are scaled only.
 
     Raises:
         UnreachableError: No place fits, at the scale that is wanted; it says which one would.
@@ -78,7 +81,7 @@ def place(
     sampled = np.array([_resampled(path, settings.num_samples) for path in paths])
     first = robot.size if scale is None else scale
     for part in settings.scales:
-        for placement in _candidates(robot, sampled, part * first, settings):
+        for placement in _candidates(robot, sampled, part * first, settings, on_table):
             if follows(robot, placement(sampled), settings):
                 if scale is not None and part < 1:
                     way_out = f"the largest scale that fits is about {placement.scale:.2g}"
@@ -107,11 +110,16 @@ def follows(robot: Robot, paths: Array, settings: PlacementSettings = PlacementS
     return True
 
 
-def _candidates(robot: Robot, paths: Array, scale: float, settings: PlacementSettings) -> Iterator[Placement]:
+def _candidates(
+    robot: Robot, paths: Array, scale: float, settings: PlacementSettings, on_table: bool
+) -> Iterator[Placement]:
     """Yield placements at a scale, the least moved first: about the shoulder, but no lower above the table."""
     about = robot.shoulder - scale * np.array(REFERENCE_SHOULDER)
     about[2] = max(about[2], min(1.0 - scale, 0.0) * paths[..., 2].min())
-    moves = sorted(product(settings.ahead, settings.up), key=lambda move: abs(move[0]) + abs(move[1]))
+    about[2] *= not on_table
+    moves = sorted(
+        product(settings.ahead, (0.0,) if on_table else settings.up), key=lambda move: abs(move[0]) + abs(move[1])
+    )
     for ahead, up in moves:
         x, y, z = about + robot.reach * np.array([0.0, -ahead, up])
         yield Placement(scale, (float(x), float(y), float(z)))

@@ -68,6 +68,10 @@ class Engine:
         self._last: dict[str, Solved] = {}
         """The last motion of each task: what is shown where a scenario has none."""
 
+    def title(self, name: str) -> str:
+        """Title of the task of that name."""
+        return self._tasks[name].title
+
     def task(self, name: str) -> Task:
         """The task of that name, which all engines share; any thread may ask for it.
 
@@ -92,7 +96,8 @@ class Engine:
             UnwantedError: it is cancelled.
         """
         self.nominal(scenario, progress)
-        others = {panel.shown: Scenario(panel.task, state=panel.state) for panel in scenario.view.panels if panel.shown}
+        shown = [panel for panel in scenario.view.panels if panel.shown]
+        others = {panel.shown: Scenario(panel.task, state=panel.state, arm=scenario.arm) for panel in shown}
         learned = {panel: self.nominal(other, progress).learned for panel, other in others.items()}
         with _cores.slot():
             frame = self._rollouts(scenario, LIVE)
