@@ -43,10 +43,6 @@ class Memo:
                 del results[next(iter(results))]
         return result
 
-    def get(self, kind: str, key: Hashable) -> Any:  # noqa: ANN401 - whatever was made
-        """The result for a key that is kept; None if none is."""
-        return self._results[kind].get(key)
-
     def count(self, kind: str) -> int:
         """Number of results of a kind that are kept."""
         return len(self._results[kind])

@@ -103,9 +103,13 @@ def follows(robot: Robot, paths: Array, settings: PlacementSettings = PlacementS
     tracked = track(robot, paths, starts, reference=reference)
     if tracked.error.max() > settings.error or tracked.limits_hit.any() or tracked.damped.any():
         return False
-    for q in tracked.q[:, ::4]:
-        near = robot.collision.nearest_to_itself(q)
-        if (near is not None and near.distance < settings.room) or robot.collision.nearest_to_table(q).distance < 0:
+    for q in tracked.q:
+        if robot.self_clearance(q, settings.room) >= settings.room and _lowest(robot, q) > 0:
+            continue  # by the spheres around the links, which are quick
+        near = robot.collision.nearest_to_itself(q[::4])
+        if (near is not None and near.distance < settings.room) or robot.collision.nearest_to_table(
+            q[::4]
+        ).distance < 0:
             return False
     return True
 
@@ -123,6 +127,11 @@ def _candidates(
     for ahead, up in moves:
         x, y, z = about + robot.reach * np.array([0.0, -ahead, up])
         yield Placement(scale, (float(x), float(y), float(z)))
+
+
+def _lowest(robot: Robot, q: Array) -> float:
+    """Compute the height above the table, metres, of the lowest sphere around the links at postures q (N, n), rad."""
+    return float((robot.links.positions(robot, q)[..., 2] - robot.links.radius).min())
 
 
 def _resampled(path: Array, num: int) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -73,17 +74,22 @@ class ArmStore:
 
 
 class Engines:
-    """The engines of one visitor, one for each arm: the newest two."""
+    """The engines of one visitor, one for each arm: the two that were used last."""
 
     def __init__(self, first: Engine, new: NewEngine | None) -> None:
         """Begin with an engine for the first arm; `new` makes others, None if there are none."""
-        self._new, self._memo = new or (lambda _name, _progress: first), Memo()
-        self._memo("engine", "", lambda: first)
+        self._new = new or (lambda _name, _progress: first)
+        self._lock, self._known = threading.Lock(), {"": first}
 
     def get(self, arm: str) -> Engine | None:
         """The engine for an arm, if that is there at once."""
-        return self._memo.get("engine", arm)
+        return self._known.get(arm)
 
     def __call__(self, arm: str, progress: Progress = lambda _fraction, _message: None) -> Engine:
         """The engine for an arm; raises as `ArmStore.engine`."""
-        return self._memo("engine", arm, lambda: self._new(arm, progress), newest=2)
+        engine = self.get(arm) or self._new(arm, progress)
+        with self._lock:
+            engine = self._known.get(arm, engine)  # the first of two that were made at once
+            others = [(name, known) for name, known in self._known.items() if name != arm]
+            self._known = dict([*others[-1:], (arm, engine)])
+        return engine

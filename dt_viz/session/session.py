@@ -174,17 +174,18 @@ class Session:
             end_if(partial(self.jobs.superseded, CHOICES))
             self._screen.tell(learning=(fraction, f"Loading the arm: {message}"))
 
+        before = self.task
         try:
             engine = self.engines(name, tell)
             tell(1.0, "placing the task in its reach")
             after = engine.task(self.scenario.task)
         finally:
             self._screen.tell(learning=None)
-        there, gone = relocated(self.scenario, self.task, after, engine.follower.robot.reaches)
+        there, gone = relocated(self.scenario, before, after, engine.follower.robot.reaches)
         scene = SCENES.get(there.scene)
         if scene is not None and scene.of_jaco and not is_jaco(engine.follower.robot):
             there = replace(there, scene="")
-        elif scene is not None and not scene.is_changed(self.scenario, self.task):
+        elif scene is not None and not scene.is_changed(self.scenario, before):
             there = replace(there, stack=scene.scenario(after).stack)
         changes = ("scene", "stack", "starts", "view", "arm_rollout")
         self.step("arm", anew=True, arm=name, **{field: getattr(there, field) for field in changes})

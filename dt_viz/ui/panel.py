@@ -88,7 +88,7 @@ class ControlPanel:
         with tabs.add_tab("Show"):
             self.show = ShowTab(gui, bindings)
         with tabs.add_tab("Arm"):
-            self.push = add_arm(gui, bindings, arms, self.begin)
+            add_arm(gui, bindings, arms, self.begin)
         with tabs.add_tab("Compare"):
             self._compare = ComparePanel(gui, bindings)
         with tabs.add_tab("Picture"):

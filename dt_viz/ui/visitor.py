@@ -21,7 +21,6 @@ from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.progress import Display, Pace, Progress
 from dt_viz.session.session import Session
-from dt_viz.ui.controls import on_press
 from dt_viz.ui.panel import ControlPanel
 from dt_viz.ui.playback import Playback
 from dt_viz.ui.ruler import Ruler
@@ -84,7 +83,6 @@ class Visitor(Display):
         )
         self.session = Session(engine, initial_scenario, task, self, arms and arms.engine)
         self._panel.connect(self.session)
-        on_press(self._panel.push, self._push)
         self.ruler = Ruler()
         """What the visitor's window is measured with."""
         self.robot.playback.begin(self.session.jobs, self.session.fail)
@@ -126,9 +124,6 @@ class Visitor(Display):
         """Stop all work: the visitor has left."""
         let_go(self)
         self.session.close()
-
-    def _push(self) -> None:
-        self.robot.playback.live.push()
 
     def _pose(self) -> None:
         """Draw the scene a moment later."""

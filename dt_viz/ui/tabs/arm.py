@@ -27,10 +27,8 @@ PUSH_HINT = (
 MODEL_HINT = "the arm: the task is placed in its reach, with all that is there; one that is new takes up to a minute"
 
 
-def add_arm(
-    gui: viser.GuiApi, bindings: Bindings, arms: Mapping[str, str], begin: Callable[..., None]
-) -> viser.GuiButtonHandle:
-    """Build the controls where the panel is being built; return the button that pushes the hand.
+def add_arm(gui: viser.GuiApi, bindings: Bindings, arms: Mapping[str, str], begin: Callable[..., None]) -> None:
+    """Build the controls where the panel is being built.
 
     Args:
         gui: controls of the visitor.
@@ -56,6 +54,7 @@ def add_arm(
         return has_no_motion or scenario.view.replay or not scenario.view.playing
 
     bindings.properties(push, disabled=stands)
+    bindings.on(push, lambda session, _pressed: session.engine.arm.push())
     bindings.checkbox(gui, "replay")
     add_disturbances(gui, bindings)
     hint = "number of the rollout that the arm follows: first those of the demonstrations, then added ones"
@@ -67,7 +66,6 @@ def add_arm(
 
     bindings.properties(followed, max=num_rollouts)
     bindings.input(followed, lambda s: s.arm_rollout + 1, lambda _s, value: {"arm_rollout": int(value) - 1})
-    return push
 
 
 def play_or_pause(session: Session, _pressed: bool = True) -> None:
