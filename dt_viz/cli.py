@@ -59,7 +59,6 @@ def _serve(options: argparse.Namespace) -> int:
     from dt_viz.learning.imitation import ImitationError  # noqa: PLC0415
     from dt_viz.learning.store import FitStore  # noqa: PLC0415
     from dt_viz.scenario.tasks import OWN, TaskEntry, known_tasks, own_task  # noqa: PLC0415
-    from dt_viz.session.tasks_in_reach import in_reach  # noqa: PLC0415
     from dt_viz.ui.patches import GateError  # noqa: PLC0415
     from dt_viz.ui.server import AddressError, Server  # noqa: PLC0415
 
@@ -68,13 +67,11 @@ def _serve(options: argparse.Namespace) -> int:
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s", handlers=[handler])
     try:
         robot = _robot(options)
-        tasks = in_reach(known_tasks(options.lasa), robot)
+        tasks = known_tasks(options.lasa)
         if options.files:
             how = {name: getattr(options, name) for name in ("rate", "unit", "columns", "topic")}
             own = own_task(load_demonstrations(options.files, **how, arm=robot))
-            entry = {OWN: TaskEntry(own.title, lambda: own)}
-            is_drawing = own.demonstrations[0].dimension == 2
-            tasks = {**(in_reach(entry, robot) if is_drawing else entry), **tasks}
+            tasks = {OWN: TaskEntry(own.title, lambda: own, own.demonstrations[0].dimension != 2), **tasks}
         begin = options.task or (OWN if options.files else "draw_s")
         if begin not in tasks:
             print(f"{PROG}: --task: found {begin!r}; accepted: {', '.join(tasks)}", file=sys.stderr)

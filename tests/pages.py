@@ -125,7 +125,7 @@ def camera_for(task: Any, camera: Any, view: str = HOME, hand: Any = None, **fra
 def panel_of(server: viser.ViserServer, notify: Any = ignored) -> ControlPanel:
     """A panel without a page."""
     camera = CameraController(cast(Any, CameraClient()), lambda: None)
-    return ControlPanel(server.gui, TITLES, load_jaco(), ignored, notify, camera, ignored)
+    return ControlPanel(server.gui, TITLES, load_jaco(), {"": "JACO"}, ignored, notify, camera, ignored)
 
 
 class NoFrames:

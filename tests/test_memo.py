@@ -81,7 +81,7 @@ def test_one_thread_alone_computes_for_a_session(new_engine, initial, monkeypatc
 
     monkeypatch.setattr(Memo, "__call__", recorded)
     engine = new_engine()
-    session = Session(engine, initial, "draw_s", cast(Any, Blank()))
+    session = Session(engine, lambda _engine, task: initial(task), "draw_s", cast(Any, Blank()))
     try:
         assert session.wait_idle(60)
 

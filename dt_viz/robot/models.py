@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -30,6 +29,7 @@ from dt_viz.robot.choices import (
 )
 from dt_viz.robot.collision import CollisionModel
 from dt_viz.robot.cover import CoverSettings, covering_tree, protrusion, usual_radius
+from dt_viz.robot.descriptions import description_of
 from dt_viz.robot.kinematics import Kinematics
 from dt_viz.robot.link_shapes import Shapes, read_shapes, reduced
 from dt_viz.robot.meshes import constant
@@ -100,22 +100,30 @@ ARMS: Mapping[str, KnownArm] = {
 """Arms of the package example-robot-data, by name."""
 
 
-def load_arm(name: str = "jaco", progress: Progress | None = None) -> Robot:
-    """Load an arm, once.
+class NotStoredError(LookupError):
+    """An arm that is not in the cache yet: making it takes seconds."""
+
+
+def load_arm(name: str = "jaco", progress: Progress | None = None, *, stored: bool = False) -> Robot:
+    """Load an arm, once; those loaded last are kept.
 
     Args:
         name: one of `ARMS`; or the name of one in the package robot_descriptions, such as "gen3", where that is
             installed and its files were downloaded before.
         progress: is told how much is done; see `robot_from_urdf`.
+        stored: whether it is taken from the cache only.
 
     Raises:
         FileNotFoundError: The package example-robot-data is not installed, or its version has no such file.
         ArmError: There is no such arm, or its description cannot be used.
+        NotStoredError: It is to be in the cache, and is not.
     """
-    return _LOADED(name, name, lambda: _load(name, progress))
+    return _LOADED("arm", name, lambda: _load(name, progress, stored), newest=NUM_LOADED)
 
 
 _LOADED = Memo()
+NUM_LOADED = 4
+"""Number of arms that are kept: one takes 10 to 270 MB."""
 
 
 def load_jaco() -> Robot:
@@ -148,9 +156,10 @@ def urdf_path(name: str = "jaco", ending: str | None = None) -> Path:
     raise FileNotFoundError(f"{DISTRIBUTION} {distribution.version} holds no {ending}; 6.0.0 does")
 
 
-def _load(name: str, progress: Progress | None) -> Robot:
+def _load(name: str, progress: Progress | None, stored: bool) -> Robot:
     if name not in ARMS:
-        return _load_described(name, progress)
+        path, folders = description_of(name, ", ".join(ARMS))
+        return robot_from_urdf(path, package_dirs=folders, name=name, progress=progress, stored=stored)
     known, urdf = ARMS[name], urdf_path(name)
     package_dir = next(folder.parent for folder in urdf.parents if folder.name == DISTRIBUTION)
     given = _Given(
@@ -158,7 +167,7 @@ def _load(name: str, progress: Progress | None) -> Robot:
         urdf_path(name, known.srdf) if known.srdf else None, (package_dir,), levers=known.levers,
         body=None if known.body is None else ASSETS / known.body,
     )  # fmt: skip
-    robot = given.load(progress)
+    robot = given.load(progress, stored=stored)
     if name != "jaco":
         return robot
     visuals = (replace(mesh, colour=RING if mesh.name.startswith("ring") else None) for mesh in robot.visuals)
@@ -174,43 +183,6 @@ def _shipped_body(file: Path) -> BodyPoints:
     return BodyPoints(spheres)
 
 
-def _load_described(name: str, progress: Progress | None) -> Robot:
-    """Load an arm that the package robot_descriptions knows and has downloaded."""
-    accepted = f"{', '.join(ARMS)}; or a name of the package robot_descriptions"
-    try:
-        cache: Any = importlib.import_module("robot_descriptions._cache")
-        repositories = importlib.import_module("robot_descriptions._repositories").REPOSITORIES
-    except ImportError as error:
-        raise ArmError("arm", "name", repr(name), f"{accepted}: pip install robot_descriptions") from error
-    module, way_out = f"{name.removesuffix('_description')}_description", f"robot_descriptions pull {name}"
-
-    def there(repository: str, **_: object) -> str:
-        path = Path(cache.os.environ.get("ROBOT_DESCRIPTIONS_CACHE", "~/.cache/robot_descriptions")).expanduser()
-        path /= repositories[repository].cache_path
-        if not path.is_dir():
-            raise ArmError("arm", "name", f"{name!r}, which is not on this machine yet", f"after: {way_out}")
-        return str(path)
-
-    cloning, cache.clone_to_cache = cache.clone_to_cache, there  # which its modules call: nothing is downloaded
-    try:
-        description = importlib.import_module(f"robot_descriptions.{module}")
-    except ModuleNotFoundError as error:
-        raise ArmError("arm", "name", repr(name), accepted) from error
-    finally:
-        cache.clone_to_cache = cloning
-    path = getattr(description, "URDF_PATH", None)
-    if path is None:
-        raise ArmError(
-            "arm", "name", f"{name!r}, a description without a URDF", "a URDF; expand a xacro file first: xacro FILE"
-        )
-    folders = [
-        Path(getattr(description, key)) for key in ("PACKAGE_PATH", "REPOSITORY_PATH") if hasattr(description, key)
-    ]
-    return robot_from_urdf(
-        path, package_dirs=[*folders, *(folder.parent for folder in folders)], name=name, progress=progress
-    )
-
-
 def robot_from_urdf(
     path: str | Path,
     end_effector: EndEffector | None = None,
@@ -222,6 +194,7 @@ def robot_from_urdf(
     *,
     name: str | None = None,
     progress: Progress | None = None,
+    stored: bool = False,
 ) -> Robot:
     """Load an arm from a URDF; what is not given is found, see `Robot.report`. It takes seconds for the first time.
 
@@ -236,14 +209,18 @@ def robot_from_urdf(
         locked: joints that do not move, perhaps each with its value, rad or metres. By default those of grippers.
         name: of the arm; by default that in the URDF.
         progress: is told the fraction that is done, and what is going on; it may raise an exception to cancel.
+        stored: whether it is taken from the cache only.
 
     Raises:
         ArmError: The URDF, a mesh, or what is given cannot be used.
+        NotStoredError: It is to be in the cache, and is not.
     """
     folders = tuple(Path(folder).expanduser().resolve() for folder in package_dirs)
     urdf, semantic = Path(path).expanduser().resolve(), None if srdf is None else Path(srdf).expanduser().resolve()
     posture = None if home is None else tuple(float(angle) for angle in home)
-    return _Given(urdf, name, name, end_effector, posture, front, semantic, folders, locked).load(progress)
+    return _Given(urdf, name, name, end_effector, posture, front, semantic, folders, locked).load(
+        progress, stored=stored
+    )
 
 
 @dataclass(frozen=True)
@@ -265,8 +242,8 @@ class _Given:
     choice: ArmSearchSettings = field(default=ArmSearchSettings())
     cover: CoverSettings = field(default=CoverSettings())
 
-    def load(self, progress: Progress | None) -> Robot:
-        """Return the arm from the cache, or make it and put it there."""
+    def load(self, progress: Progress | None, *, stored: bool = False) -> Robot:
+        """Return the arm from the cache, or make it and put it there, unless only one that is `stored` is wanted."""
         tell = progress or (lambda _fraction, _message: None)
         tell(0.0, "reading the URDF")
         semantic, chain, text, files, name = self._read()
@@ -288,6 +265,8 @@ class _Given:
         names = {"name": name, "title": self.title or name, "urdf": self.urdf, "package_dirs": self.package_dirs}
         robot = arm_cache.read(stored, names)
         if robot is None:
+            if stored:
+                raise NotStoredError(name)
             robot = self._robot(semantic, chain, text, name, tell)
             arm_cache.write(stored, robot)
         tell(1.0, "")

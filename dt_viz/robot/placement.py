@@ -60,6 +60,8 @@ def place(
     paths: Sequence[Array],
     scale: float | None = None,
     settings: PlacementSettings = PlacementSettings(),
+    *,
+    on_table: bool = False,
 ) -> Placement:
     """Find where an arm follows the paths of a task that was made for the JACO, or for an arm of its size.
 
@@ -71,26 +73,34 @@ def place(
         paths: (T, 3) positions of the hand on each, metres, with the arm's front at −y.
         scale: the scale that is wanted; None takes the largest that fits, up to that of the arm's reach.
         settings: what is tried.
+        on_table: whether heights above the table are scaled only.
 
     Raises:
         UnreachableError: No place fits, at the scale that is wanted; it says which one would.
     """
     sampled = np.array([resampled(path, settings.num_samples) for path in paths])
-    placement = fitting(robot, sampled, robot.size if scale is None else scale, settings)
+    placement = fitting(robot, sampled, robot.size if scale is None else scale, settings, on_table=on_table)
     if scale is not None and placement.scale < scale:
         way_out = f"the largest scale that fits is about {placement.scale:.2g}"
         raise UnreachableError(f"{robot.title} cannot follow the task at the scale {scale:.3g}: {way_out}")
     return placement
 
 
-def fitting(robot: Robot, paths: Array, scale: float, settings: PlacementSettings = PlacementSettings()) -> Placement:
+def fitting(
+    robot: Robot,
+    paths: Array,
+    scale: float,
+    settings: PlacementSettings = PlacementSettings(),
+    *,
+    on_table: bool = False,
+) -> Placement:
     """Find where an arm follows paths (R, T, 3), metres, at the largest scale up to a given one; see `place`.
 
     Raises:
         UnreachableError: no place fits.
     """
     for part in settings.scales:
-        for placement in _candidates(robot, paths, part * scale, settings):
+        for placement in _candidates(robot, paths, part * scale, settings, on_table):
             if follows(robot, placement(paths), settings):
                 return placement
     least = settings.scales[-1] * scale
@@ -109,21 +119,35 @@ def follows(robot: Robot, paths: Array, settings: PlacementSettings = PlacementS
     tracked = track(robot, paths, starts, reference=reference)
     if tracked.error.max() > settings.error or tracked.limits_hit.any() or tracked.damped.any():
         return False
-    for q in tracked.q[:, ::4]:
-        near = robot.collision.nearest_to_itself(q)
-        if (near is not None and near.distance < settings.room) or robot.collision.nearest_to_table(q).distance < 0:
+    for q in tracked.q:
+        if robot.self_clearance(q, settings.room) >= settings.room and _lowest(robot, q) > 0:
+            continue  # by the spheres around the links, which are quick
+        near = robot.collision.nearest_to_itself(q[::4])
+        if (near is not None and near.distance < settings.room) or robot.collision.nearest_to_table(
+            q[::4]
+        ).distance < 0:
             return False
     return True
 
 
-def _candidates(robot: Robot, paths: Array, scale: float, settings: PlacementSettings) -> Iterator[Placement]:
+def _candidates(
+    robot: Robot, paths: Array, scale: float, settings: PlacementSettings, on_table: bool
+) -> Iterator[Placement]:
     """Yield placements at a scale, the least moved first: about the shoulder, but no lower above the table."""
     about = robot.shoulder - scale * np.array(REFERENCE_SHOULDER)
     about[2] = max(about[2], min(1.0 - scale, 0.0) * paths[..., 2].min())
-    moves = sorted(product(settings.ahead, settings.up), key=lambda move: abs(move[0]) + abs(move[1]))
+    about[2] *= not on_table
+    moves = sorted(
+        product(settings.ahead, (0.0,) if on_table else settings.up), key=lambda move: abs(move[0]) + abs(move[1])
+    )
     for ahead, up in moves:
         x, y, z = about + robot.reach * np.array([0.0, -ahead, up])
         yield Placement(scale, (float(x), float(y), float(z)))
+
+
+def _lowest(robot: Robot, q: Array) -> float:
+    """Compute the height above the table, metres, of the lowest sphere around the links at postures q (N, n), rad."""
+    return float((robot.links.positions(robot, q)[..., 2] - robot.links.radius).min())
 
 
 def resampled(path: Array, num: int) -> Array:

@@ -6,7 +6,7 @@ What an object does depends on where it is and where the hand goes, so it stays 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -34,6 +34,12 @@ class Hand:
     """Time since it came there, seconds; 0 until then."""
 
 
+def scaled(sizes: tuple[float, float, float], scale: float) -> tuple[float, float, float]:
+    """Return sizes, metres, times a scale."""
+    x, y, z = sizes
+    return scale * x, scale * y, scale * z
+
+
 class TaskObject(ABC):
     """An object that the hand moves."""
 
@@ -45,6 +51,10 @@ class TaskObject(ABC):
     @abstractmethod
     def surface(self) -> tuple[Array, Indices]:
         """Return vertices (V, 3), metres, about its place, and faces (F, 3), outward."""
+
+    @abstractmethod
+    def placed(self, scale: float, x: float, y: float) -> TaskObject:
+        """Return it scaled about the base's foot and moved along the table by x and y, metres."""
 
     @abstractmethod
     def moved(self, place: Array, hand: Hand) -> Array:
@@ -74,6 +84,10 @@ class Pot:
         profile = [(0.0, 0.0), (outer, 0.0), (outer, self.height), (inner, self.height), (inner, WALL), (0.0, WALL)]
         return lathe(profile, 64)
 
+    def placed(self, scale: float, x: float, y: float) -> Pot:
+        """Return it scaled and moved along the table, metres."""
+        return Pot(scale * self.x + x, scale * self.y + y, scale * self.radius, scale * self.height)
+
     def catches(self, position: Array) -> bool:
         """Return whether an object released at `position` (3,), metres, falls into it."""
         x, y, z = (float(c) for c in position)
@@ -94,6 +108,9 @@ class Ball(TaskObject):
 
     def surface(self) -> tuple[Array, Indices]:
         return Sphere((0.0, 0.0, 0.0), 2 * self.radius).surface()
+
+    def placed(self, scale: float, x: float, y: float) -> Ball:
+        return Ball(tuple(pot.placed(scale, x, y) for pot in self.pots), scale * self.radius)
 
     def moved(self, place: Array, hand: Hand) -> Array:
         return hand.place if hand.arrived == 0 else self.fallen(hand.goal, hand.arrived)
@@ -117,6 +134,8 @@ class PushedBox(TaskObject):
     """Length along the direction, width and height, metres."""
     friction: float = 0.5
     """Way that it is taken aside for each metre that it is pushed."""
+    fingers: float = FINGERS
+    """Distance of the hand's point from what it pushes, metres."""
 
     @classmethod
     def before(cls, hand: Array, goal: Array) -> PushedBox:
@@ -134,11 +153,15 @@ class PushedBox(TaskObject):
         x, y = self.direction
         return vertices @ np.array([[x, y, 0.0], [-y, x, 0.0], [0.0, 0.0, 1.0]]), faces
 
+    def placed(self, scale: float, x: float, y: float) -> PushedBox:
+        middle, sizes = (scale * self.middle[0] + x, scale * self.middle[1] + y), scaled(self.sizes, scale)
+        return replace(self, middle=middle, sizes=sizes, fingers=scale * self.fingers)
+
     def moved(self, place: Array, hand: Hand) -> Array:
         along, across = np.array(self.direction), np.array([-self.direction[1], self.direction[0]])
         length, width, height = self.sizes
         offset, step = hand.place[:2] - place[:2], hand.place[:2] - hand.before[:2]
-        ahead = float(offset @ along) + length / 2 + FINGERS
+        ahead = float(offset @ along) + length / 2 + self.fingers
         behind = offset @ along < 0 and abs(offset @ across) < width / 2 and hand.place[2] < height
         if not behind or ahead <= 0 or hand.arrived > 0:
             return place
@@ -172,6 +195,10 @@ class LiftedBox(TaskObject):
         num = len(parts[0][0])
         faces = np.concatenate([faces + k * num for k, (_, faces) in enumerate(parts)])
         return np.concatenate([vertices for vertices, _ in parts]), faces
+
+    def placed(self, scale: float, x: float, y: float) -> LiftedBox:
+        middle, sizes = (scale * self.middle[0] + x, scale * self.middle[1] + y), scaled(self.sizes, scale)
+        return LiftedBox(middle, scale * self.grasp, sizes, scale * self.near)
 
     def moved(self, place: Array, hand: Hand) -> Array:
         step, grasped = hand.place - hand.before, place[2] > 0

@@ -230,6 +230,8 @@ class Scenario:
     """Number of the rollout that the arm follows: those from the task's starts come first, then those from `starts`."""
     scene: str = ""
     """Name of the paper's scene that it began as, if any."""
+    arm: str = ""
+    """Name of the arm, of those that are offered; the first one if empty."""
     view: View = field(default_factory=View)
     passing: Passing | None = field(default=None, compare=False)
     """Detours and reference posture of motions, kept while an obstacle is dragged; None until the session decides."""
@@ -243,8 +245,8 @@ class Scenario:
     def learned(self) -> tuple[object, ...]:
         """What the motion that transforms are stacked on depends on."""
         if self.style and self.imitation:
-            return self.task, self.style, self.style_amount
-        return self.task, self.imitation, self.objective, self.state
+            return self.arm, self.task, self.style, self.style_amount
+        return self.arm, self.task, self.imitation, self.objective, self.state
 
     @property
     def avoidance(self) -> Avoidance:
@@ -299,9 +301,9 @@ class Scenario:
         return replace(self.motion, warp=1.0)
 
     @property
-    def fit(self) -> tuple[str, Objective, State]:
-        """What is to be learned before there are motions."""
-        return self.task, self.objective, self.state
+    def fit(self) -> tuple[str, str, Objective, State]:
+        """What is to be loaded and learned before there are motions."""
+        return self.arm, self.task, self.objective, self.state
 
     def begins_like(self, other: Scenario) -> bool:
         """Return whether both have the same task, fit and scene, so that one is a small edit of the other."""

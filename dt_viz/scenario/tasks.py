@@ -74,6 +74,8 @@ class Task:
     """Settings of what is done to the demonstrations before they are learned."""
     seen: tuple[str, ...] = ()
     """What was found about the demonstrations and shown before they were learned: it is no warning any more."""
+    size: float = 1.0
+    """Scale at which `placed` has put it, and at which what is added to it is made."""
 
     def to_world(self, points: Array) -> Array:
         """Transform points (*B, k) of the demonstrations to the world, (*B, 3), metres."""
@@ -84,13 +86,14 @@ class Task:
         return imitation.system_in(self.origin, self.axes, self.scale)
 
     def placed(self, scale: float, shift: ArrayLike) -> Task:
-        """Scale and move the task, x ↦ scale·x + shift (3,) metres, without the objects that the JACO's hand moves."""
+        """Scale and move the task, x ↦ scale·x + shift (3,) metres; off the table it is without objects on that."""
 
         def mapped(point: ArrayLike) -> Array:
             return scale * np.asarray(point) + np.asarray(shift)
 
         eye, target = (as_point(mapped(point)) for point in self.camera)
         width, height = self.slice.half_size
+        x, y, z = as_point(np.asarray(shift))
         return replace(
             self,
             origin=mapped(self.origin),
@@ -98,10 +101,16 @@ class Task:
             slice=replace(self.slice, centre=mapped(self.slice.centre), half_size=(scale * width, scale * height)),
             camera=(eye, target),
             obstacle_position=as_point(mapped(self.obstacle_position)),
-            hint="Drag the sphere into the way." if self.objects or self.pots else self.hint,
-            pots=(),
-            objects=(),
+            size=scale * self.size,
+            hint="Drag the sphere into the way." if z and self.on_table else self.hint,
+            pots=() if z else tuple(pot.placed(scale, x, y) for pot in self.pots),
+            objects=() if z else tuple(one.placed(scale, x, y) for one in self.objects),
         )
+
+    @property
+    def on_table(self) -> bool:
+        """Whether something of it stands on the table."""
+        return bool(self.objects or self.pots)
 
     @cached_property
     def paths(self) -> tuple[Array, ...]:
@@ -125,6 +134,8 @@ class TaskEntry:
 
     title: str
     load: Callable[[], Task]
+    is_fixed: bool = False
+    """Whether it stays where it was recorded, whatever the arm."""
 
     def __call__(self) -> Task:
         """The task, loaded on first use; all threads get the same one."""

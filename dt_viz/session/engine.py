@@ -74,6 +74,10 @@ class Engine:
         self.own: dict[str, tuple[Task, FitStore]] = {}
         """The visitor's own tasks by name, the oldest first, and what was learned from each: nobody else sees them."""
 
+    def title(self, name: str) -> str:
+        """Title of the task of that name."""
+        return self._tasks[name].title
+
     def task(self, name: str) -> Task:
         """The task of that name, which all engines share but for a visitor's own; any thread may ask for it.
 
@@ -96,10 +100,14 @@ class Engine:
         task = replace(task, name=f"{OWN}_{number}", title=f"Your data {number}" if number > 1 else "Your data")
         oldest = next((name for name in self.own if name != shown), None) if len(self.own) >= MOST_OWN else None
         own = {name: kept for name, kept in self.own.items() if name != oldest}
-        self.own = own | {task.name: (task, FitStore(None))}  # at once: others read it
-        if oldest is not None:
-            self._last.pop(oldest, None)
+        self.adopt(own | {task.name: (task, FitStore(None))})
         return task, oldest
+
+    def adopt(self, own: dict[str, tuple[Task, FitStore]]) -> None:
+        """Take the visitor's own tasks as his engine for another arm has them."""
+        gone, self.own = self.own.keys() - own.keys(), own  # at once: others read it
+        for name in gone:
+            self._last.pop(name, None)
 
     def frames(
         self, scenario: Scenario, progress: Progress | None = None, cancelled: Cancelled = never
@@ -117,7 +125,8 @@ class Engine:
             UnwantedError: it is cancelled.
         """
         self.nominal(scenario, progress)
-        others = {panel.shown: Scenario(panel.task, state=panel.state) for panel in scenario.view.panels if panel.shown}
+        shown = [panel for panel in scenario.view.panels if panel.shown]
+        others = {panel.shown: Scenario(panel.task, state=panel.state, arm=scenario.arm) for panel in shown}
         learned = {panel: self.nominal(other, progress).learned for panel, other in others.items()}
         with _cores.slot():
             frame = self._rollouts(scenario, LIVE)

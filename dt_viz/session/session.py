@@ -11,13 +11,16 @@ from functools import partial
 from typing import Any
 
 from dt_viz.avoidance.passing import ANEW
-from dt_viz.errors import DataError, UnwantedError
+from dt_viz.errors import DataError, UnwantedError, end_if
 from dt_viz.learning.imitation import ImitationError
+from dt_viz.robot.placement import is_jaco
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.paper_scenes import SCENES
+from dt_viz.scenario.relocation import relocated
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import IMITATION, as_fresh
 from dt_viz.scenario.tasks import Task
+from dt_viz.session.arms import Engines, NewEngine
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.history import History
@@ -31,8 +34,8 @@ HABITS = ("playing", "replay", "speed", "joint_plots", "health_plots")
 """Fields of the view that are a visitor's way of working, and stay when a scene of the paper comes or goes."""
 REST = 0.1
 """Time that a scenario must rest before it is refined, seconds: while a hand moves, edits come faster."""
-LANE = "session"
-"""Lane of the jobs on which the newest scenario is computed."""
+LANE, CHOICES = "session", "task"
+"""Lanes of the jobs on which the newest scenario is computed, and the task, scene or arm that was chosen last read."""
 
 
 def _with_a_level_of_its_own(scenario: Scenario) -> Scenario:
@@ -46,19 +49,28 @@ def _with_a_level_of_its_own(scenario: Scenario) -> Scenario:
 class Session:
     """A scenario with its history, and the jobs that compute its frames."""
 
-    def __init__(self, engine: Engine, initial: Callable[[str], Scenario], task: str, display: Display) -> None:
+    def __init__(
+        self,
+        engine: Engine,
+        initial: Callable[[Engine, str], Scenario],
+        task: str,
+        display: Display,
+        new_engine: NewEngine | None = None,
+    ) -> None:
         """Start with a task.
 
         Args:
-            engine: used by this session only.
-            initial: the scenario that a task begins with. It may raise what `Engine.task` raises.
+            engine: for the first arm, used by this session only.
+            initial: the scenario that a task of an engine begins with. It may raise what `Engine.task` raises.
             task: the first task's name.
             display: where results go.
+            new_engine: makes engines for other arms; None if there are none.
         """
-        self._engine = engine
+        self.engines = Engines(engine, new_engine)
+        """Engines of this session, by its arms."""
         self._initial = initial
         self._lock = threading.Lock()
-        self.scenario = initial(task)
+        self.scenario = initial(engine, task)
         self._screen = Screen(display, self.scenario)
         self._history = History()
         self._unadopted = False
@@ -75,14 +87,19 @@ class Session:
         self._submit()
 
     @property
+    def engine(self) -> Engine:
+        """The engine for the scenario's arm."""
+        return self.engines(self.scenario.arm)
+
+    @property
     def robot(self) -> Robot:
         """The arm."""
-        return self._engine.follower.robot
+        return self.engine.follower.robot
 
     @property
     def task(self) -> Task:
         """The scenario's task. Raises what `Engine.task` raises."""
-        return self._engine.task(self.scenario.task)
+        return self.engine.task(self.scenario.task)
 
     def edit(self, gesture: str, *, anew: bool = False, **changes: Any) -> None:  # noqa: ANN401 - the fields of Scenario
         """Replace some values of the scenario and have it computed anew.
@@ -121,7 +138,7 @@ class Session:
 
     def take_phase(self) -> None:
         """Show augmented motions on the slice at the phase at which the arm is."""
-        self.step("phase", view=replace(self.scenario.view, phase=round(self._engine.arm.left, 2)))
+        self.step("phase", view=replace(self.scenario.view, phase=round(self.engine.arm.left, 2)))
 
     def end_gesture(self) -> None:
         """The user let go: the next edit is a step of its own for undo. What ends as it began is no step."""
@@ -136,7 +153,7 @@ class Session:
             DemonstrationError: its demonstrations cannot be used; the session stays with its task.
         """
         if name != self.scenario.task:
-            fresh = self._initial(name)
+            fresh = self._initial(self.engine, name)
             if self.scenario.scene:  # of the paper: leaves nothing behind
                 self._begin("task", self._as_seen(fresh))
                 return
@@ -145,21 +162,56 @@ class Session:
 
     def bring(self, task: Task) -> tuple[Task, str | None]:
         """Take a task of the visitor's own, to be chosen; see `Engine.bring`."""
-        own, gone = self._engine.bring(task, self.scenario.task)
+        own, gone = self.engines.bring(task, self.scenario)
         if gone is not None:
             with self._lock:
                 self._history.forget(gone)
         return own, gone
 
+    def choose_arm(self, name: str) -> None:
+        """Go on with another arm, and all that is there where the task is in its reach; called on the lane `CHOICES`.
+
+        Raises:
+            DataError, FileNotFoundError: it cannot be loaded; the session stays with its own.
+            UnwantedError: something else is chosen meanwhile.
+        """
+        if name == self.scenario.arm:
+            return
+
+        def tell(fraction: float, message: str) -> None:
+            end_if(partial(self.jobs.superseded, CHOICES))
+            self._screen.tell(learning=(fraction, f"Loading the arm: {message}"))
+
+        before = self.task
+        try:
+            engine = self.engines(name, tell)
+            tell(1.0, "placing the task in its reach")
+            after = engine.task(self.scenario.task)
+        finally:
+            self._screen.tell(learning=None)
+        there, gone = relocated(self.scenario, before, after, engine.follower.robot.reaches)
+        scene = SCENES.get(there.scene)
+        if scene is not None and scene.of_jaco and not is_jaco(engine.follower.robot):
+            there = replace(there, scene="")
+        elif scene is not None and not scene.is_changed(self.scenario, before):
+            there = replace(there, stack=scene.scenario(after).stack)
+        changes = ("scene", "stack", "starts", "view", "arm_rollout")
+        self.step("arm", anew=True, arm=name, **{field: getattr(there, field) for field in changes})
+        if gone:
+            self.say(
+                f"Out of reach of the {engine.follower.robot.title}, and left out: {', '.join(gone)}.", Severity.NOTE
+            )
+
     def reset(self) -> None:
         """Back to how the task or the scene began, and was looked at; the motion's part of it can be undone."""
         scene = SCENES.get(self.scenario.scene)
-        self._begin("reset", self._initial(self.scenario.task) if scene is None else scene.scenario(self.task))
+        fresh = self._initial(self.engine, self.scenario.task) if scene is None else scene.scenario(self.task)
+        self._begin("reset", fresh)
 
     def leave_scene(self) -> None:
         """Back to how the task of the scene begins; can be undone. Nothing is done while there is no scene."""
         if self.scenario.scene:
-            self._begin("scene", self._as_seen(self._initial(self.scenario.task)))
+            self._begin("scene", self._as_seen(self._initial(self.engine, self.scenario.task)))
 
     def load(self, task: str, scenario: Callable[[Task], Scenario]) -> None:
         """Begin with a scenario for a task, seen as its scene wants it, or else as what is shown now; can be undone.
@@ -167,10 +219,10 @@ class Session:
         Raises:
             DemonstrationError: the task's demonstrations cannot be used; the session stays with its own.
         """
-        self._begin("load", self._as_seen(scenario(self._engine.task(task))))
+        self._begin("load", self._as_seen(scenario(self.engine.task(task))))
 
     def _begin(self, gesture: str, fresh: Scenario) -> None:
-        changes = {name: getattr(fresh, name) for name in fresh.__dataclass_fields__ if name != "passing"}
+        changes = {name: getattr(fresh, name) for name in fresh.__dataclass_fields__ if name not in ("arm", "passing")}
         self.step(gesture, anew=True, **changes)
 
     def _as_seen(self, other: Scenario) -> Scenario:
@@ -195,18 +247,19 @@ class Session:
         self._travel(self._history.redone)
 
     def cancel(self) -> None:
-        """Stop learning a task and go back to what was shown before. Nothing is done while nothing is learned."""
+        """Stop learning a task, or loading an arm, and go back to what was shown; nothing is done without either."""
         with self._lock:
             abandoned, shown = self.scenario, self._shown
             learning = self._screen.progress.learning is not None
             if not learning or (shown is not None and abandoned.fit == shown.scenario.fit):
+                self.jobs.submit(CHOICES, lambda: None, latest=True)  # of an arm, which is not the scenario's yet
                 return
             self._stopped = not self._retreat(abandoned)
         self._adopt()
         instead = "Choose another task, or move the obstacle to start again."
         if shown is not None:
             instead = f"This is “{self.task.title}” as before."
-        title = self._engine.task(abandoned.task).title
+        title = self.engine.title(abandoned.task)
         self._screen.tell(learning=None)
         self.say(f"Learning “{title}” was cancelled. {instead}", Severity.WARNING)
 
@@ -220,7 +273,7 @@ class Session:
 
     def fail(self, error: Exception) -> None:
         """Show what went wrong; what is shown stays."""
-        expected = isinstance(error, DataError | ImitationError)
+        expected = isinstance(error, DataError | ImitationError | FileNotFoundError)
         self._screen.tell(failed=True, learning=None)
         self.say(str(error) if expected else f"{type(error).__name__}: {error}", Severity.ALARM)
 
@@ -267,7 +320,9 @@ class Session:
         self._stopped = False
         if self._screen.progress.failed:
             self._screen.tell(failed=False)
-        self._engine.see(self.scenario)
+        engine = self.engines.get(self.scenario.arm)
+        if engine is not None:
+            engine.see(self.scenario)
         compute = partial(self._compute, self.scenario, time.perf_counter())
         self._num_skipped += self.jobs.submit(LANE, compute, latest=True)
 
@@ -311,14 +366,16 @@ class Session:
 
     def _show_frames(self, scenario: Scenario, edited: float, superseded: Callable[[], bool]) -> None:
         self._catch_up()
-        for frame in self._engine.frames(scenario, partial(self._learn, scenario), superseded):
+        learn = partial(self._learn, scenario)
+        engine = self.engines(scenario.arm, learn)
+        for frame in engine.frames(scenario, learn, superseded):
             drawn = self._shown is not None and scenario.choices == self._shown.scenario.choices
             self._shown = frame
             if frame.stage is Stage.ROLLOUTS and drawn:
                 continue  # it is only looked at in another way: the next stage is what changes
             self._screen.draw(frame, edited, self._num_skipped)
             if frame.stage in (Stage.ROLLOUTS, Stage.FINE):
-                self._engine.drive(frame)
+                engine.drive(frame)
             if frame.stage is Stage.LIVE:
                 self.jobs.rest(LANE, REST)
             elif frame.stage is Stage.ROLLOUTS:

@@ -22,14 +22,20 @@ def in_reach(tasks: Mapping[str, TaskEntry], robot: Robot) -> Mapping[str, TaskE
     """
     if is_jaco(robot):
         return tasks
-    return {name: replace(entry, load=partial(_placed, entry, robot)) for name, entry in tasks.items()}
+    return {
+        name: entry if entry.is_fixed else replace(entry, load=partial(_placed, entry, robot))
+        for name, entry in tasks.items()
+    }
 
 
 def _placed(entry: TaskEntry, robot: Robot) -> Task:
     task = entry()
-    try:
-        placement = place(robot, task.paths)
-    except UnreachableError as error:
-        logger.warning("%s: %s", entry.title, error)
-        return task
-    return task.placed(placement.scale, placement.shift)
+    reason: UnreachableError | None = None
+    for on_table in (True, False) if task.on_table else (False,):
+        try:
+            placement = place(robot, task.paths, on_table=on_table)
+            return task.placed(placement.scale, placement.shift)
+        except UnreachableError as error:
+            reason = error
+    logger.warning("%s: %s", entry.title, reason)
+    return task

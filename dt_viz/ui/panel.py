@@ -17,8 +17,9 @@ from dt_viz.scenario.stack import avoidance_layer, avoiding_with
 from dt_viz.scenario.tasks import Task
 from dt_viz.session.frame import Frame
 from dt_viz.session.progress import Message, Progress
-from dt_viz.session.session import Session
+from dt_viz.session.session import CHOICES, Session
 from dt_viz.ui.bindings import Bindings
+from dt_viz.ui.controls import Control
 from dt_viz.ui.scene.camera import CameraController
 from dt_viz.ui.scene.legend import Legend
 from dt_viz.ui.scene.palette import Colour
@@ -31,9 +32,8 @@ from dt_viz.ui.tabs.show import ShowTab
 from dt_viz.ui.tabs.stack import StackPanel
 from dt_viz.ui.tabs.status import COLOURS, StatusLine, hint, hint_html, sentence
 from dt_viz.ui.tabs.world import add_obstacles, add_starts, add_transforms
+from dt_viz.warning import Severity
 
-LANE = "task"
-"""Lane of the session's jobs on which the task or scene that was chosen last is read."""
 MAX_UPLOAD = 50 * 10**6
 """Largest number of bytes of what a visitor sends."""
 NO_SCENE = "–"
@@ -50,6 +50,7 @@ class ControlPanel:
         gui: viser.GuiApi,
         titles: Mapping[str, str],
         robot: Robot,
+        arms: Mapping[str, str],
         save_png: Callable[[str, bool], None],
         notify: Callable[[str, Colour], None],
         tripod: CameraController,
@@ -61,7 +62,8 @@ class ControlPanel:
         Args:
             gui: controls of the visitor.
             titles: titles of the tasks, by name.
-            robot: robot whose joints are plotted.
+            robot: the first arm.
+            arms: titles of the arms that may be chosen, by their names.
             save_png: makes a picture, given the resolution's name and whether it is transparent.
             notify: shows a text in a colour beside the panel, however far that is scrolled.
             tripod: stand of the visitor's camera.
@@ -70,12 +72,12 @@ class ControlPanel:
         """
         self._notify, self._tripod, self._titles = notify, tripod, dict(titles)
         self._notified: Message | None = None
-        self._scenes = {scene.title: scene for scene in offered(self._titles, jaco=is_jaco(robot))}
+        self._scenes = {scene.title: scene for scene in offered(self._titles)}
         self.bindings = bindings = Bindings()
         self.presentation = Presentation(gui, self._turn, lambda alone: tripod.reframe(alone=alone))
         bindings.show(self._title, self.presentation.entitle)
         big = BigType(gui, tripod)
-        self._add_choices(gui, preview)
+        self._scene = self._add_choices(gui, preview)
         self.hint = gui.add_html(hint_html(""))
         add_avoid_and_imitate(gui, bindings)
         self.status = StatusLine(gui, bindings)
@@ -89,9 +91,9 @@ class ControlPanel:
         with tabs.add_tab("Stack"):
             StackPanel(gui, bindings)
         with tabs.add_tab("Show"):
-            self.show = ShowTab(gui, bindings, robot)
+            self.show = ShowTab(gui, bindings)
         with tabs.add_tab("Arm"):
-            self.push = add_arm(gui, bindings)
+            add_arm(gui, bindings, arms, self.begin)
         with tabs.add_tab("Compare"):
             self._compare = ComparePanel(gui, bindings)
         with tabs.add_tab("Picture"):
@@ -100,6 +102,14 @@ class ControlPanel:
         commands = self._commands(gui.main_panel, picture)
         add_commands(gui, bindings, commands)
         add_about(gui, commands)
+        self.take(robot)
+
+    def take(self, robot: Robot) -> None:
+        """Plot the joints of another arm, and offer the scenes that it has."""
+        self.show.joints.take(robot)
+        offers = {scene.title: scene for scene in offered(self._titles, jaco=is_jaco(robot))}
+        if offers != self._scenes:
+            self._scenes, self._scene.handle.options = offers, (NO_SCENE, *offers)
 
     def connect(self, session: Session) -> None:
         """Let the controls edit this session."""
@@ -136,7 +146,9 @@ class ControlPanel:
         self.hint.content = hint_html(text)
         self.presentation.caption(text)
 
-    def _add_choices(self, gui: viser.GuiApi, preview: Show) -> None:
+    def _add_choices(self, gui: viser.GuiApi, preview: Show) -> Control:
+        """Add the dropdowns of tasks and scenes, and what opens recordings; return that of the scenes."""
+
         def choose(session: Session, title: str) -> None:
             session.choose_task(next(name for name in self._titles if self._titles[name] == title))
 
@@ -144,7 +156,7 @@ class ControlPanel:
         self.bindings.properties(tasks, options=lambda _: tuple(self._titles.values()))
         self.bindings.choice(tasks, lambda s: self._titles[s.task], partial(self.begin, choose))
         OpenPanel(gui, self.bindings, preview, self._learn, MAX_UPLOAD)
-        self.bindings.choice(
+        return self.bindings.choice(
             gui.add_dropdown("Scene", (NO_SCENE, *self._scenes), hint="scenes of the paper's figures"),
             lambda s: SCENES[s.scene].title if s.scene in SCENES else NO_SCENE,
             partial(self.begin, self._load),
@@ -168,17 +180,20 @@ class ControlPanel:
         """Go to a scene so many places after the shown one; before the first is the last."""
         scenario, titles = self.bindings.scenario, tuple(self._scenes)
         if scenario is not None:
-            shown = titles.index(self._title(scenario)) if scenario.scene in SCENES else min(-step, 0)
+            title = self._title(scenario)
+            shown = titles.index(title) if title in titles else min(-step, 0)
             self.begin(self._load, self.bindings.session, titles[(shown + step) % len(titles)])
 
     def _load(self, session: Session, title: str) -> None:
         if title == NO_SCENE:
             session.leave_scene()
-        else:
+        elif title in self._scenes:
             session.load(self._scenes[title].task, prepared(self._scenes[title]))
+        else:
+            session.say(f"“{title}” is made for the JACO: choose it in Arm → Model.", Severity.WARNING)
 
     def begin(self, begin: Callable[[Session, str], None], session: Session, title: str) -> None:
-        """Begin a task or a scene beside the server's event loop; if that fails, show why and stay."""
+        """Begin a task, a scene or an arm beside the server's event loop; if that fails, show why and stay."""
 
         def work() -> None:
             session.expect(True)
@@ -191,7 +206,7 @@ class ControlPanel:
                 session.expect(False)
 
         session.expect(True)
-        session.jobs.submit(LANE, work, latest=True)
+        session.jobs.submit(CHOICES, work, latest=True)
 
     def _commands(self, panel: Any, picture: PictureTab) -> list[Command]:  # noqa: ANN401 - viser's, without a name
         folded = False  # a visitor may unfold it by hand, which nobody is told of

@@ -13,10 +13,9 @@ from typing import NoReturn
 import viser
 
 from dt_viz.learning.store import FitStore
-from dt_viz.memo import Memo
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.tasks import TaskEntry
-from dt_viz.session.engine import Engine
+from dt_viz.session.arms import ArmStore
 from dt_viz.ui.gate import Gate, Limits
 from dt_viz.ui.origins import Origin, Origins
 from dt_viz.ui.panel import MAX_UPLOAD
@@ -54,7 +53,7 @@ class Server:
         """Listen and wait for visitors.
 
         Args:
-            tasks: tasks by name.
+            tasks: tasks by name, made for the JACO.
             fits: store shared by all visitors.
             robot: the arm.
             task: first task of each visitor.
@@ -69,9 +68,9 @@ class Server:
             GateError: this version of viser is not supported.
         """
         port = _checked_port(host, port)
-        titles, shared = {name: entry.title for name, entry in tasks.items()}, Memo()
+        titles, arms = {name: entry.title for name, entry in tasks.items()}, ArmStore(tasks, fits, robot)
         self._new_visitor: Callable[[viser.ClientHandle], Visitor] = lambda client: Visitor(
-            client, Engine(tasks, fits, robot, shared), robot, titles, task
+            client, arms.engine(), robot, titles, task, arms
         )
         self._max_sessions = max_sessions
         self._lock = threading.Condition()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -15,12 +16,12 @@ from dt_viz.obstacles.shapes import Sphere
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import with_avoidance
+from dt_viz.session.arms import ArmStore
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.opening import Preview
 from dt_viz.session.progress import Display, Pace, Progress
 from dt_viz.session.session import Session
-from dt_viz.ui.controls import on_press
 from dt_viz.ui.panel import ControlPanel
 from dt_viz.ui.playback import Playback
 from dt_viz.ui.ruler import Ruler
@@ -31,10 +32,10 @@ from dt_viz.ui.scene.robot_scene import RobotScene
 from dt_viz.ui.scene.scene import ScenePictures
 
 
-def initial_scenario(engine: Engine, task: str) -> Scenario:
+def initial_scenario(engine: Engine, name: str) -> Scenario:
     """Return the scenario that a task begins with. Raises what `Engine.task` raises."""
-    scenario = Scenario(task)
-    sphere = Sphere(engine.task(task).obstacle_position)
+    scenario, task = Scenario(name), engine.task(name)
+    sphere = Sphere(task.obstacle_position, task.size * Sphere.diameter)
     return replace(scenario, stack=with_avoidance(scenario, obstacles=(sphere,)))
 
 
@@ -47,16 +48,23 @@ class Visitor(Display):
     """Shows a session in the browser of one visitor."""
 
     def __init__(
-        self, client: viser.ClientHandle, engine: Engine, robot: Robot, titles: Mapping[str, str], task: str
+        self,
+        client: viser.ClientHandle,
+        engine: Engine,
+        robot: Robot,
+        titles: Mapping[str, str],
+        task: str,
+        arms: ArmStore | None = None,
     ) -> None:
         """Build the page and start computing.
 
         Args:
             client: connection of the visitor.
             engine: engine of this visitor only.
-            robot: robot to draw.
+            robot: the first arm.
             titles: titles of the tasks, by name.
             task: name of the first task.
+            arms: arms to choose from; None is the first one alone.
         """
         self.client = client
         self.shown: Frame | None = None
@@ -68,20 +76,24 @@ class Visitor(Display):
         with client.atomic():
             self.pictures = ScenePictures(client.scene, robot, lambda: self.session)
             self.robot = RobotScene(client, robot, Playback(engine.arm, self._pose))
+        self._exchanging = threading.RLock()  # the arm is moved, and shown or hidden, by other threads
+        self._arm = ""
+        """Name of the arm that is drawn."""
+        titled = {"": robot.title} if arms is None else arms.titles
         self._camera = CameraController(client, lambda: self.robot.hand, robot.size)
         self._panel = ControlPanel(
             client.gui,
             titles,
             robot,
+            titled,
             self._save_png,
             partial(notify, client),
             self._camera,
             self._darken,
             self._preview,
         )
-        self.session = Session(engine, lambda name: initial_scenario(engine, name), task, self)
+        self.session = Session(engine, initial_scenario, task, self, arms and arms.engine)
         self._panel.connect(self.session)
-        on_press(self._panel.push, engine.arm.push)
         self.ruler = Ruler()
         """What the visitor's window is measured with."""
         self.robot.playback.begin(self.session.jobs, self.session.fail)
@@ -97,6 +109,8 @@ class Visitor(Display):
 
     def draw(self, frame: Frame, pace: Pace) -> None:
         beside = tuple(panel.shown for panel in frame.pictures.panels)
+        if frame.scenario.arm != self._arm:
+            self._exchange(frame.scenario.arm)
         others = frame.stage is not Stage.ROLLOUTS and len(beside) != len(self._camera.panels)
         if self.shown is None or frame.task is not self.shown.task or others:
             self._camera.look(frame.task, beside)
@@ -109,7 +123,7 @@ class Visitor(Display):
         self.shown = frame
 
     def adopt(self, scenario: Scenario) -> None:
-        with self.client.atomic():
+        with self.client.atomic(), self._exchanging:
             self.pictures.adopt(scenario)
             self.robot.adopt(scenario.view, self.pictures.look)
         self._panel.adopt(scenario)
@@ -139,7 +153,22 @@ class Visitor(Display):
         """Draw the scene a moment later."""
         now = time.monotonic()
         self._camera.turn(now)
-        self.robot.pose(now, self.pictures.look.tubes)
+        with self._exchanging:
+            self.robot.pose(now, self.pictures.look.tubes)
+
+    def _exchange(self, name: str) -> None:
+        """Draw the arm of a name in place of the one that is drawn."""
+        engine = self.session.engines(name)
+        robot = engine.follower.robot
+        with self.client.atomic(), self._exchanging:
+            self.robot.remove()
+            self._arm, self.robot = name, RobotScene(self.client, robot, Playback(engine.arm, self._pose))
+            self.pictures.take(self.client.scene, robot)
+            self.robot.paint(self._theme)
+            self.robot.adopt(self.session.scenario.view, self.pictures.look)
+            self._panel.take(robot)
+        self.robot.playback.begin(self.session.jobs, self.session.fail)  # and the one before ends
+        self._camera.reframe(arm_size=robot.size)
 
     def _dress(self, theme: Theme) -> None:
         """Show the panel in a theme."""
@@ -155,7 +184,7 @@ class Visitor(Display):
 
     def _paint(self, theme: Theme) -> None:
         """Show the scene in a theme."""
-        with self.client.atomic():
+        with self.client.atomic(), self._exchanging:
             self.pictures.paint(theme)
             self.robot.paint(theme)
 
@@ -171,5 +200,6 @@ class Visitor(Display):
     def _save_png(self, resolution: str, transparent: bool) -> None:
         with self.pictures.without_handles(), self.robot.grip.hidden(), self._light():
             content = render_png(self.client, RESOLUTIONS[resolution], self._panel.legend, transparent=transparent)
-        name = f"dt-viz-{self.session.scenario.task}.png"
+        scenario = self.session.scenario
+        name = f"dt-viz-{'-'.join(filter(None, (scenario.task, scenario.arm)))}.png"
         self.client.send_file_download(name, content, save_immediately=True)

@@ -134,7 +134,7 @@ def run(options: argparse.Namespace) -> int:
     scenario, shown = _scenario(task, options), Recorder()
     engine = _timed(new_engine(tasks), shown)
     engine.nominal(scenario)  # learned before
-    session = Session(engine, lambda _: scenario, task.name, shown)
+    session = Session(engine, lambda *_: scenario, task.name, shown)
     positions = moving_through(task)
     try:
         _settle(session)

@@ -55,6 +55,9 @@ class FakeEngine:
     def task(self, name):
         return SimpleNamespace(title=name)
 
+    def title(self, name):
+        return name
+
     def frames(self, scenario, progress=None, cancelled=never):
         self.asked.append(scenario)
         self.begun.set()
@@ -141,7 +144,7 @@ def opened(monkeypatch):
     monkeypatch.setattr(session_module.time, "monotonic", lambda: clock[0])
     monkeypatch.setattr(session_module, "REST", 0.0)
     engine, page = FakeEngine(), Page()
-    session = Session(cast(Engine, engine), fresh, "draw_s", page)
+    session = Session(cast(Engine, engine), lambda _engine, task: fresh(task), "draw_s", page)
     result = Opened(session, engine, page, clock)
     result.settle()
     yield result
@@ -648,7 +651,7 @@ def test_moving_the_obstacle_does_not_begin_learning_anew(opened):
 def test_the_first_task_can_be_cancelled_too_and_any_edit_begins_again():
     engine, page = FakeEngine(), Page()
     engine.unlearned = {"draw_s"}
-    session = Session(cast(Engine, engine), fresh, "draw_s", page)
+    session = Session(cast(Engine, engine), lambda _engine, task: fresh(task), "draw_s", page)
     try:
         assert engine.learning.wait(PATIENCE)
         session.cancel()

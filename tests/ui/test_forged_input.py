@@ -18,8 +18,8 @@ from dt_viz.scenario.paper_scenes import offered
 from dt_viz.scenario.scenario import View
 from dt_viz.scenario.stack import anchored
 from dt_viz.scenario.tasks import TASKS
+from dt_viz.session.session import CHOICES
 from dt_viz.ui import controls, gestures
-from dt_viz.ui.panel import LANE
 from dt_viz.ui.scene import markers
 from dt_viz.ui.scene.camera import view_of
 
@@ -317,7 +317,7 @@ def test_commands_do_what_the_controls_do_each_on_a_key_of_its_own(page):
     titles = [command.label for command in commands.values()][-len(SCENES) :]
     assert titles == [scene.title for scene in SCENES]
     page.give(by_key["2", None])
-    assert page.session.jobs.wait_idle(LANE, 30)
+    assert page.session.jobs.wait_idle(CHOICES, 30)
     assert page.session.scenario.scene == SCENES[1].name
     page.session.leave_scene()
 
@@ -359,7 +359,7 @@ def test_the_presentation_goes_from_scene_to_scene_and_folds_no_panel(page, monk
     page.session.leave_scene()
 
     def shown():
-        assert page.session.jobs.wait_idle(LANE, 30)
+        assert page.session.jobs.wait_idle(CHOICES, 30)
         return page.session.scenario.scene
 
     def is_on():

@@ -137,7 +137,8 @@ def test_an_arm_with_other_joints_is_drawn_where_its_kinematics_say(server, scen
         np.testing.assert_allclose(pose.rotation().as_matrix(), rotation, atol=1e-6)
     shown = [link.visible for link in arms.ghost.links]
     assert len(shown) == sum(bool(body.parts) for body in bodies(robot)[2:]) and any(shown)
-    plots, times = JointPlots(server.gui, robot), np.linspace(0.0, 2.0, 9)
+    plots, times = JointPlots(server.gui), np.linspace(0.0, 2.0, 9)
+    plots.take(robot)
     plots.visible = True
     joints = robot.home + np.linspace(0, 1, 9)[:, None] * (q - robot.home)
     plots.follow(ArmMotion(times, joints, joints))
@@ -345,7 +346,8 @@ def test_two_samples_at_one_time_give_a_finite_speed():
 
 
 def test_plots_are_drawn_only_while_shown_with_the_limits_of_limited_joints(server):
-    plots = JointPlots(server.gui, ROBOT)
+    plots = JointPlots(server.gui)
+    plots.take(ROBOT)
     plots.follow(motion())
     assert len(plots.angles.data[0]) != NUM_SAMPLES
     plots.visible = True

@@ -122,7 +122,7 @@ class TestDrawing:
         drawing = carrying.drawing
 
         def shown():
-            return [node.visible for node in (drawing._board, drawing._pen, drawing.ink.node)]
+            return [node.visible for node in (drawing.board, drawing._pen, drawing.ink.node)]
 
         assert shown() == [True] * 3
         carrying.show(arm=False)

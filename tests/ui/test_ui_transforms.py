@@ -136,7 +136,7 @@ class Quiet:
 
 @pytest.fixture
 def session():
-    session = Session(cast(Engine, Sketches()), lambda _: SCENARIO, "draw_s", cast(Any, Quiet()))
+    session = Session(cast(Engine, Sketches()), lambda *_: SCENARIO, "draw_s", cast(Any, Quiet()))
     yield session
     session.close()
 

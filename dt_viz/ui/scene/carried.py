@@ -26,10 +26,14 @@ class Objects:
         self.items: tuple[tuple[TaskObject, viser.MeshHandle], ...] = ()
         """What the hand moves, and its picture."""
 
-    def stand(self, task: Task) -> None:
-        """Show the objects of another task where they are at first."""
+    def remove(self) -> None:
+        """Take all of them from the scene."""
         for handle in (*self.pots, *(handle for _, handle in self.items)):
             handle.remove()
+
+    def stand(self, task: Task) -> None:
+        """Show the objects of another task where they are at first."""
+        self.remove()
         self._posed, add = False, self._scene.add_mesh_simple
         self.pots = tuple(
             add(f"/pots/{k}", *pot.surface(), color=LIGHT.pot, position=(pot.x, pot.y, 0.0), flat_shading=True)
@@ -90,7 +94,7 @@ class Drawing:
             tip: (3,) where the end effector is, in the hand's frame, metres.
             axis: (3,) direction of the hand, and of the pen to its tip, in that frame.
         """
-        self._board = scene.add_mesh_simple(
+        self.board = scene.add_mesh_simple(
             "/board",
             np.zeros((4, 3), np.float32),
             np.array([[0, 1, 2], [0, 2, 3]]),
@@ -123,13 +127,13 @@ class Drawing:
         self._area = task.slice if task.draws else None
         self._wipe()
         if self._area is not None:
-            self._board.vertices = self._area.border[:4].astype(np.float32)
+            self.board.vertices = self._area.border[:4].astype(np.float32)
         self.show(arm=self._arm)
 
     def show(self, *, arm: bool) -> None:
         """Show all only with the arm."""
         self._arm = arm
-        for node in (self._board, self._pen, self.ink.node):
+        for node in (self.board, self._pen, self.ink.node):
             node.visible = arm and self._area is not None
 
     def pose(self, moment: float, hand: Hand, theme: Theme, *, sets_out: bool) -> None:
@@ -170,6 +174,12 @@ class Carried:
             self._task, self._hand = task, None
             self.objects.stand(task)
             self.drawing.stand(task)
+
+    def remove(self) -> None:
+        """Take all from the scene but what is in the hand."""
+        self.objects.remove()
+        for node in (self.drawing.board, self.drawing.ink.node):
+            node.remove()
 
     def show(self, *, arm: bool) -> None:
         """Show all only with the arm."""

@@ -84,6 +84,7 @@ class TheirArm:
 
     def __init__(self, scene: viser.SceneApi, robot: Robot) -> None:
         self._ghost = GhostArm(scene, robot, "/their_arm")
+        self.node = self._ghost.node
         self._replay, self._seen = Replay(), 0.0
 
     def draw(self, frame: Frame) -> None:

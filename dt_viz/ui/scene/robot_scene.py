@@ -38,6 +38,13 @@ class RobotScene:
         self._posed: tuple[bytes, bool] | None = None
         """The posture that was drawn last, and whether with that without avoidance."""
 
+    def remove(self) -> None:
+        """Take it from the scene."""
+        for node in (self.arms.arm.frames[0], self.arms.ghost.node, self.arms.body.node, self.their_arm.node):
+            node.remove()
+        self.carried.remove()
+        self.path.node.remove()
+
     @property
     def hand(self) -> Array | None:
         """Where the hand is, (3,), metres; None before it moves."""

@@ -118,6 +118,13 @@ class ScenePictures:
         """Whether the last frame belongs to another task or scene than the scenario adopted since."""
         return not (self._frame is None or self._adopted is None or self._frame.scenario.begins_like(self._adopted))
 
+    def take(self, scene: viser.SceneApi, robot: Robot) -> None:
+        """Show another arm from now on."""
+        with self._drawing:
+            self._by_view["onion"].node.remove()
+            self._by_view["onion"] = ArmSequence(scene, robot)
+        self._show()
+
     def draw(self, frame: Frame) -> None:
         """Assign fresh arrays to the handles."""
         with self._drawing:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import viser
@@ -23,8 +24,24 @@ PUSH_HINT = (
 )
 
 
-def add_arm(gui: viser.GuiApi, bindings: Bindings) -> viser.GuiButtonHandle:
-    """Build the controls where the panel is being built; return the button that pushes the hand."""
+MODEL_HINT = "the arm: the task is placed in its reach, with all that is there; one that is new takes up to a minute"
+
+
+def add_arm(gui: viser.GuiApi, bindings: Bindings, arms: Mapping[str, str], begin: Callable[..., None]) -> None:
+    """Build the controls where the panel is being built.
+
+    Args:
+        gui: controls of the visitor.
+        bindings: of them.
+        arms: titles of the arms that may be chosen, by their names.
+        begin: as `ControlPanel.begin`.
+    """
+    names = {title: name for name, title in arms.items()}
+    bindings.choice(
+        gui.add_dropdown("Model", tuple(names), hint=MODEL_HINT),
+        lambda s: arms[s.arm],
+        partial(begin, lambda session, title: session.choose_arm(names[title])),
+    )
     play = gui.add_button("Pause")
     bindings.properties(play, label=lambda s: "Pause" if s.view.playing else "Play")
     bindings.on(play, play_or_pause)
@@ -37,6 +54,7 @@ def add_arm(gui: viser.GuiApi, bindings: Bindings) -> viser.GuiButtonHandle:
         return has_no_motion or scenario.view.replay or not scenario.view.playing
 
     bindings.properties(push, disabled=stands)
+    bindings.on(push, lambda session, _pressed: session.engine.arm.push())
     bindings.checkbox(gui, "replay")
     add_disturbances(gui, bindings)
     hint = "number of the rollout that the arm follows: first those of the demonstrations, then added ones"
@@ -48,7 +66,6 @@ def add_arm(gui: viser.GuiApi, bindings: Bindings) -> viser.GuiButtonHandle:
 
     bindings.properties(followed, max=num_rollouts)
     bindings.input(followed, lambda s: s.arm_rollout + 1, lambda _s, value: {"arm_rollout": int(value) - 1})
-    return push
 
 
 def play_or_pause(session: Session, _pressed: bool = True) -> None:

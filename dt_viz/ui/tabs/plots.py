@@ -113,23 +113,30 @@ def joint_curves(motion: ArmMotion, robot: Robot, num: int = NUM_SAMPLES) -> Joi
 class JointPlots(Following):
     """A folder with the plots of the joints."""
 
-    def __init__(self, gui: viser.GuiApi, robot: Robot) -> None:
-        """Make the folder, hidden."""
-        self._robot = robot
+    def __init__(self, gui: viser.GuiApi) -> None:
+        """Make the folder, hidden, without curves until it takes a robot."""
+        folder = gui.add_folder("Joints", visible=False)
+        super().__init__(folder)
+        with folder:
+            self._key = gui.add_html("")
+            self.angles = add_plot(gui, "Angle [°]; dashed: limits", "t [s]", (curve("", palette.LIGHT.arm_ring),), 170)
+            title = f"Speed [% of its limit], up to {MAX_SPEED}; time [s]"
+            self.speeds = add_plot(gui, title, "t [s]", (curve("", palette.LIGHT.arm_ring),), 170)
+
+    def take(self, robot: Robot) -> None:
+        """Show a robot's motions from now on."""
+        self._robot, self._motion = robot, None
         limited = [j for j in range(robot.num_joints) if np.isfinite(robot.lower[j])]
         self._limits = np.degrees(np.stack([robot.lower[limited], robot.upper[limited]], axis=1)).ravel()
         colours = [colour for colour, _ in zip(cycle(palette.LIGHT.joints), robot.joint_names, strict=False)]
         joints = [curve(f"{j}", colour) for j, colour in enumerate(colours, start=1)]
         limits = [curve("limit", colours[j], width=1, dashed=True) for j in limited for _ in range(2)]
         limit = curve("limit", palette.LIGHT.arm_ring, width=1, dashed=True)
-        folder = gui.add_folder("Joints", visible=False)
-        super().__init__(folder)
-        with folder:
-            marks = {f"{j}": f"background:{css(colour)}" for j, colour in enumerate(colours, start=1)}
-            gui.add_html(legend(marks, "0.3em", "Joint"))
-            self.angles = add_plot(gui, "Angle [°]; dashed: limits", "t [s]", (*joints, *limits), 170)
-            title = f"Speed [% of its limit], up to {MAX_SPEED}; time [s]"
-            self.speeds = add_plot(gui, title, "t [s]", (*joints, limit), 170)
+        marks = {f"{j}": f"background:{css(colour)}" for j, colour in enumerate(colours, start=1)}
+        self._key.content = legend(marks, "0.3em", "Joint")
+        for plot, curves in ((self.angles, (*joints, *limits)), (self.speeds, (*joints, limit))):
+            plot.series = (uplot.Series(label="t [s]"), *curves)
+            plot.data = (np.zeros(2),) * (1 + len(curves))
 
     def _show(self, motion: ArmMotion) -> None:
         curves = joint_curves(motion, self._robot)

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import viser
 
-from dt_viz.robot.robot import Robot
 from dt_viz.scenario.scenario import OFFERS, SLICE_COLOURS, Scenario, SliceColour
 from dt_viz.scenario.stack import side_by_side
 from dt_viz.session.frame import Frame
@@ -45,12 +44,12 @@ IN_SCENE = (
 class ShowTab:
     """The controls of one visitor's tab."""
 
-    def __init__(self, gui: viser.GuiApi, bindings: Bindings, robot: Robot) -> None:
-        """Build the controls where the panel is being built; the plots are those of a robot's joints."""
+    def __init__(self, gui: viser.GuiApi, bindings: Bindings) -> None:
+        """Build the controls where the panel is being built."""
         self.slice = SlicePanel(gui, bindings)
         # each plot under its checkbox, high up in the tab, to be seen when it opens
         bindings.checkbox(gui, "joint_plots")
-        self.joints = JointPlots(gui, robot)
+        self.joints = JointPlots(gui)
         bindings.properties(self.joints, visible=lambda s: s.view.joint_plots)
         bindings.checkbox(gui, "health_plots")
         self.health = HealthPlots(gui)

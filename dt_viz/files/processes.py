@@ -1,0 +1,33 @@
+"""Python processes of our own, beside the server."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import IO, Any
+
+
+def start_module(
+    name: str, *arguments: str, output: int | IO[Any], given: int = subprocess.DEVNULL
+) -> subprocess.Popen:
+    """Start a module of this package as a process, with one thread for linear algebra.
+
+    Args:
+        name: full name of the module.
+        arguments: of its command line.
+        output: file or pipe of its standard output.
+        given: that of its standard input.
+    """
+    root = Path(__file__).parents[2]  # holds this package
+    path = os.pathsep.join([str(root), *filter(None, sys.path)])
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    return subprocess.Popen(
+        [sys.executable, "-m", name, *arguments],
+        cwd=root,  # where -m looks first
+        env=os.environ | threads | {"PYTHONPATH": path},
+        stdin=given,
+        stdout=output,
+        stderr=subprocess.DEVNULL,
+    )

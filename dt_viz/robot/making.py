@@ -1,0 +1,94 @@
+"""Arms made in a process of their own: covering one with spheres takes seconds, in which a server has others to serve.
+
+The process stores the arm in the user's cache folder, from where it is loaded. It writes lines of JSON: the fraction
+that is done and what is going on, and at the end nothing, or the four parts of a `DataError`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import threading
+from contextlib import suppress
+
+from dt_viz.errors import DataError
+from dt_viz.files.processes import start_module
+from dt_viz.robot.models import NotStoredError, Progress, load_arm
+from dt_viz.robot.robot import Robot
+from dt_viz.robot.urdf import ArmError
+
+LOOK = 0.2
+"""Time after which somebody who waits is asked again whether the arm is wanted, seconds."""
+_one_arm = threading.Lock()
+"""Lock of those who make an arm: one at a time."""
+
+
+def load_aside(name: str, progress: Progress) -> Robot:
+    """Load an arm; one that is new is made in a process of its own, with low priority.
+
+    Args:
+        name: as of `load_arm`.
+        progress: as of `load_arm`; it is also called without news, and may raise an exception to cancel.
+
+    Raises:
+        ArmError: There is no such arm, or its description cannot be used.
+        FileNotFoundError: The package example-robot-data is not installed, or its version has no such file.
+    """
+    try:
+        return load_arm(name, progress, stored=True)
+    except NotStoredError:
+        pass
+    while not _one_arm.acquire(timeout=LOOK):
+        progress(0.0, "waits for another arm, which is being made")
+    try:
+        _make(name, progress)
+    finally:
+        _one_arm.release()
+    return load_arm(name, progress)
+
+
+def _make(name: str, progress: Progress) -> None:
+    """Have a process make an arm and store it. Raises ArmError if that refuses it; another end is not told."""
+    process = start_module(__name__, name, output=subprocess.PIPE)
+    told, done = [0.0, "starting"], threading.Event()
+
+    def listen() -> None:
+        assert process.stdout is not None
+        with suppress(ValueError):  # something else than JSON
+            for line in process.stdout:
+                told[:] = json.loads(line)
+        done.set()
+
+    listening = threading.Thread(target=listen, name="making", daemon=True)
+    listening.start()
+    try:
+        while not done.wait(LOOK):
+            progress(*told)
+    finally:
+        process.kill()
+        process.wait()
+        listening.join()
+        assert process.stdout is not None
+        process.stdout.close()
+    if len(told) == len(ArmError("", "", "", "").args):
+        raise ArmError(*told)
+
+
+def main() -> None:
+    """Make the arm of the name on the command line."""
+    with suppress(AttributeError, OSError):  # not on Windows
+        os.nice(10)
+
+    def tell(*told: object) -> None:
+        print(json.dumps(told), flush=True)
+
+    try:
+        load_arm(sys.argv[1], tell)
+    except DataError as error:
+        tell(*error.args)
+
+
+if __name__ == "__main__":
+    main()

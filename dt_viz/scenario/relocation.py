@@ -1,0 +1,94 @@
+"""A scenario taken along to where its task is placed for another arm."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from dt_viz.avoidance.avoidance import Avoidance
+from dt_viz.avoidance.transform import Anchored, Transform
+from dt_viz.flows.fields import Array, Mask
+from dt_viz.obstacles.shapes import Box, Cylinder, Obstacle, Point, Sphere, as_point
+from dt_viz.scenario.scenario import MAX_DIAMETER, MIN_DIAMETER, Layer, Scenario, Start
+from dt_viz.scenario.tasks import Task
+
+DIGITS = 7
+"""Decimal places that lengths are rounded to, metres: there and back is the same to the last bit."""
+
+
+@dataclass(frozen=True)
+class Relocation:
+    """The map x ↦ scale·x + shift from where a task was to where it is now."""
+
+    scale: float
+    shift: Point
+    """Metres."""
+
+    @classmethod
+    def between(cls, before: Task, after: Task) -> Relocation:
+        """Return the map of the same task's world at two places; they differ in place and scale only."""
+        scale = after.scale / before.scale
+        return cls(scale, as_point(after.origin - scale * before.origin))
+
+    def point(self, place: Point) -> Point:
+        """Map a place, metres."""
+        return as_point((self.scale * np.array(place) + self.shift).round(DIGITS))
+
+    def obstacle(self, obstacle: Obstacle) -> Obstacle:
+        """Map an obstacle. What comes from a file keeps its size, others theirs within the limits of the page."""
+        moved = obstacle.moved(self.point(obstacle.position), obstacle.wxyz)
+        if not isinstance(moved, Sphere | Box | Cylinder):
+            return moved
+        names = [name for name in ("diameter", "height", "sizes") if hasattr(moved, name)]
+        sizes = {name: np.round(self.scale * np.array(getattr(moved, name)), DIGITS) for name in names}
+        bounded = {name: np.clip(size, MIN_DIAMETER, MAX_DIAMETER).tolist() for name, size in sizes.items()}
+        changes: Any = {name: tuple(size) if isinstance(size, list) else size for name, size in bounded.items()}
+        return replace(moved, **changes)
+
+    def transform(self, transform: Transform) -> Transform:
+        """Map the places and lengths of a transform."""
+        if isinstance(transform, Avoidance):
+            return replace(transform, obstacles=tuple(map(self.obstacle, transform.obstacles)))
+        if isinstance(transform, Anchored):
+            radius = transform.radius and round(self.scale * transform.radius, DIGITS)
+            return replace(transform, position=self.point(transform.position), radius=radius)
+        return transform
+
+
+def relocated(
+    scenario: Scenario, before: Task, after: Task, reaches: Callable[[Array], Mask]
+) -> tuple[Scenario, tuple[str, ...]]:
+    """Return a scenario with all that is added to its task where that is for another arm.
+
+    Args:
+        scenario: the scenario.
+        before: its task where it was.
+        after: the same task where it is now.
+        reaches: tells which of some places (N, 3), metres, the arm gets to.
+
+    Returns:
+        The scenario, and what was left out of it as the arm does not get there, as the page names it.
+    """
+    to = Relocation.between(before, after)
+    starts = [Start(to.point(start.place), start.label) for start in scenario.starts]
+    layers = [replace(layer, transform=to.transform(layer.transform)) for layer in scenario.stack]
+    view, slice_pose = scenario.view, scenario.view.slice
+    if slice_pose is not None:
+        view = replace(view, slice=replace(slice_pose, position=to.point(slice_pose.position)))
+
+    def is_there(place: Point) -> bool:
+        return place[2] > 0 and bool(reaches(np.array(place)))
+
+    gone = [f"start {k}" for k, start in enumerate(starts, 1) if not is_there(start.place)]
+    gone += [layer.name for layer in layers if not _stays(layer, is_there)]
+    kept = tuple(start for start in starts if is_there(start.place))
+    stack = tuple(layer for layer in layers if _stays(layer, is_there))
+    rollout = scenario.arm_rollout if len(kept) == len(starts) else 0
+    return replace(scenario, starts=kept, stack=stack, view=view, arm_rollout=rollout), tuple(gone)
+
+
+def _stays(layer: Layer, is_there: Callable[[Point], bool]) -> bool:
+    return not isinstance(layer.transform, Anchored) or is_there(layer.transform.position)
