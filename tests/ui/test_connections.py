@@ -22,12 +22,12 @@ from websockets.asyncio.client import connect
 from websockets.typing import Subprotocol
 
 from dt_viz.evaluate.protocol_client import OBSTACLE, LostError, ProtocolClient
-from dt_viz.obstacles.files import MAX_BYTES
 from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.progress import Pace
 from dt_viz.ui import gate
 from dt_viz.ui.origins import Origin
+from dt_viz.ui.panel import MAX_UPLOAD
 from dt_viz.ui.patches import GateError
 from dt_viz.ui.ruler import Ruler
 from dt_viz.ui.server import Server
@@ -387,7 +387,7 @@ def uploads_of(visitor):
 @pytest.mark.parametrize(
     ("content", "announced", "said"),
     [
-        (bytes(3 * 2**20), MAX_BYTES + 1, "x.stl: file: found 20.0 MB; accepted: at most 20 MB"),
+        (bytes(3 * 2**20), MAX_UPLOAD + 1, "x.stl: file: found 50.0 MB; accepted: at most 50 MB"),
         (bytes(2**20), None, "x.stl: "),  # it arrives, and is no mesh
     ],
     ids=["announced too large", "no mesh"],

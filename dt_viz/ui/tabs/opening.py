@@ -141,7 +141,7 @@ class OpenPanel:
     def open(self) -> None:
         """Show the folder, and get ready for files."""
         self.folder.visible, self.controls["open"].handle.visible = True, False
-        self._bindings.session.jobs.submit(LANE, make_ready)
+        self._bindings.session.jobs.submit("ready", make_ready)  # a lane of its own: that of files must be free for one
 
     def close(self) -> None:
         """Let go of what is open, and show what was shown before. Nothing is done while nothing is open."""
@@ -182,6 +182,9 @@ class OpenPanel:
             with turn(partial(session.say, wait, Severity.WARNING), unwanted):
                 known = opening.read(opened.files, opened.answers, session.robot, unwanted)
             opening.preview(known, opened.choices, session.robot)
+            if len(opened.files) > opened.num_read and len(known.takes) <= len(opened.recordings.takes):
+                name, *_ = opened.files[-1]
+                raise DataError(name, "takes", f"none ({'; '.join(known.refused)[-200:]})", "at least one")
         except DataError as error:
             session.say(str(error), Severity.ALARM)
             self._change(opened.files, files=opened.files[: opened.num_read])
@@ -200,11 +203,14 @@ class OpenPanel:
     def _see(self) -> None:
         """Show what is open, at first without what the arm can reach; nothing once it is changed or closed."""
         opened, robot = self._opened, self._bindings.session.robot
-        if opened.recordings.takes:
+        try:
             seen = opening.preview(opened.recordings, opened.choices, robot)
-            if not opened.choices.fits_reach:
-                self._put(opened, seen)
-            self._put(opened, opening.with_reach(seen, opened.choices, robot))
+        except DataError as error:  # such as in another unit
+            self._bindings.session.say(str(error), Severity.ALARM)
+            return
+        if not opened.choices.fits_reach:
+            self._put(opened, seen)
+        self._put(opened, opening.with_reach(seen, opened.choices, robot))
 
     def _put(self, opened: Opened, seen: Preview) -> None:
         with self._changing:

@@ -14,7 +14,7 @@ from dt_viz.warning import Severity
 
 HEADS: Mapping[FindingKind, tuple[str, str]] = {
     "units": ("<br>unit", "another unit than the others’"),
-    "outliers": ("outlier<br>mm", "distance of a single sample far off; of several their number"),
+    "outliers": ("jump<br>mm", "distance of a single sample far off; of several their number"),
     "gap": ("gap<br>s", "longest time without samples"),
     "jitter": ("jitter<br>mm", "how far it trembles"),
     "pause": ("pause<br>s", "how long it stands still"),
@@ -35,11 +35,13 @@ def seen_html(seen: Preview, number: int) -> str:
     rows = "".join(_row(k, take, heads, chosen=k == number) for k, take in enumerate(seen.takes))
     named = [("time<br>s", "duration"), ("<br>n", "samples"), ("rate<br>Hz", "samples a second")]
     titles = "".join(
-        f"<td style='text-align:right;opacity:0.65;padding-left:0.5em' title='{hint}'>{title}</td>"
+        f"<td style='text-align:right;opacity:0.65;padding-left:0.35em' title='{hint}'>{title}</td>"
         for title, hint in (*named, *(HEADS[kind] for kind in heads))
     )
     table = f"<table style='width:100%;font-size:0.85em;line-height:1.3'><tr><td></td>{titles}</tr>{rows}</table>"
-    return small("".join(told)) * bool(told) + small(f"<div style='max-height:21em;overflow:auto'>{table}</div>")
+    return small("".join(told)) * bool(told) + small(
+        f"<div style='max-height:21em;overflow:auto;margin:0 -0.6em'>{table}</div>"
+    )
 
 
 def _row(number: int, take: SeenTake, heads: Sequence[FindingKind], *, chosen: bool) -> str:
@@ -48,7 +50,7 @@ def _row(number: int, take: SeenTake, heads: Sequence[FindingKind], *, chosen: b
     colour = LIGHT.stale if left else LIGHT.takes[number % len(LIGHT.takes)]
     said = [f"{each.text}: {each.remedy or 'nothing is done'}" for each in own.findings]
     said += ["out of the arm's reach"] * take.is_far + ["left out by you"] * (not take.is_chosen)
-    mark = f"display:inline-block;width:1.1em;border-top:0.28em {'dashed' if left else 'solid'} {css(colour)}"
+    mark = f"display:inline-block;width:0.8em;border-top:0.28em {'dashed' if left else 'solid'} {css(colour)}"
     cells = [("", f"{own.duration:.3g}", False), ("", f"{own.num_samples}", False), ("", f"{own.rate:.3g}", False)]
     for kind in heads:
         of_kind = [each for each in own.findings if each.kind == kind]
@@ -56,13 +58,13 @@ def _row(number: int, take: SeenTake, heads: Sequence[FindingKind], *, chosen: b
         cells.append(("; ".join(each.text for each in of_kind), amounts, any(not each.remedy for each in of_kind)))
     warned = f";font-weight:700;color:{ink(COLOURS[Severity.WARNING][0])}"
     figures = "".join(
-        f"<td style='text-align:right;padding-left:0.5em{warned if is_left else ''}' title='{html.escape(title)}'>"
+        f"<td style='text-align:right;padding-left:0.35em{warned if is_left else ''}' title='{html.escape(title)}'>"
         f"{html.escape(text)}</td>"
         for title, text, is_left in (cells[:3] if left else cells)
     )
     why = html.escape(said[-1] if said else "left out")
     far = f"<td style='{warned[1:]}'>out of reach</td>" if take.is_far else ""
-    reason = f"<td colspan='{len(heads)}' style='padding-left:0.5em'>{why}</td>" if left else far
+    reason = f"<td colspan='{len(heads)}' style='padding-left:0.35em'>{why}</td>" if left else far
     return (
         f"<tr style='{'opacity:0.6' if left else ''}' title='{html.escape('; '.join(said))}'>"
         f"<td style='font-weight:{700 if chosen else 400};max-width:7em;overflow:hidden;"

@@ -1,0 +1,273 @@
+"""The folder "Your data": what is opened is seen, chosen about, and learned by a click; nothing forged gets through."""
+
+import io
+import math
+import zipfile
+
+import numpy as np
+import pytest
+import viser  # noqa: TID251 - forges what a browser sends
+from pages import PATIENCE, Page, wait_until
+
+from dt_viz.files import uploads
+from dt_viz.learning.inspection import PreparationSettings
+from dt_viz.scenario.tasks import TASKS
+from dt_viz.ui.panel import LANE as TASK_LANE
+from dt_viz.ui.scene.palette import LIGHT
+from dt_viz.ui.tabs import opening
+from dt_viz.ui.tabs.from_file import LANE
+from dt_viz.ui.tabs.opening import SEEING, SWITCHES
+
+RNG = np.random.default_rng(2)
+GOAL = np.array([0.2, -0.45, 0.3])
+
+
+def csv(goal=GOAL, timed=True, jitter=0.0, size=1.0, num=200):
+    u = np.linspace(0, 1, num)
+    start = np.array([-0.2, -0.4, 0.2]) + RNG.normal(scale=0.01, size=3)
+    path = start + (3 * u**2 - 2 * u**3)[:, None] * (goal - start) + RNG.normal(scale=jitter, size=(num, 3))
+    path[:, 2] += 0.1 * np.sin(np.pi * u)
+    rows = np.column_stack([*([4 * u] if timed else []), size * path])
+    header = "t,x,y,z" if timed else "x,y,z"
+    return "\n".join([header, *(",".join(f"{value:.6f}" for value in row) for row in rows)]).encode()
+
+
+def zipped(**files):
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, content in files.items():
+            archive.writestr(f"{name}.csv", content)
+    return file.getvalue()
+
+
+class Opening:
+    """The folder of a page, and its visitor's clicks."""
+
+    def __init__(self, page: Page, told: list[str]) -> None:
+        self.page, self.told = page, told
+
+    def __getitem__(self, label):
+        return self.page[label]
+
+    def labels(self):
+        return {handle.label for handle in self.page.inputs if handle.visible}
+
+    def open(self):
+        self.page.claim(self["Open your demonstrations"], True)
+
+    def add(self, name, content):
+        self.page.claim(self["Choose files, or drop them here"], viser.UploadedFile(name, content))
+        self.done()
+
+    def choose(self, label, value):
+        self.page.claim(self[label], value)
+        self.done()
+
+    def done(self):
+        for lane in (LANE, SEEING, TASK_LANE):
+            assert self.page.session.jobs.wait_idle(lane, PATIENCE)
+
+    @property
+    def takes(self):
+        return self.page.visitor.pictures._takes
+
+    @property
+    def num_drawn(self):
+        return sum(len(lines.node.points) > 0 for lines in self.takes.learned)
+
+
+@pytest.fixture(name="opened")
+def _opened(server, robot, monkeypatch):
+    monkeypatch.setattr(uploads, "_ready", uploads._Ready())
+    page, told = Page(server, robot), []
+    monkeypatch.setattr(page.session, "say", lambda text, _severity: told.append(text))
+    opened = Opening(page, told)
+    opened.open()
+    yield opened
+    page.close()
+    server.gui.reset()
+    server.scene.reset()
+
+
+def test_what_is_opened_is_seen_in_place_of_the_motion_until_it_is_cancelled(opened):
+    assert not opened.takes.visible and opened["Learn"].disabled
+    opened.add("a.csv", csv())
+    assert opened.takes.visible and opened.num_drawn == 1 and not opened["Learn"].disabled
+    opened.add("b.zip", zipped(b=csv(jitter=0.002), c=csv(GOAL + np.array([-0.3, 0.0, 0.2])), d=csv()))
+    assert opened.num_drawn == 3 and len(opened.takes.left_out.node.points) > 0
+    np.testing.assert_allclose(opened.takes.goal.position, GOAL, atol=0.01)
+    assert {"Smooth jitter", "One goal only", "Use this take"} <= opened.labels()
+    assert not {"Cut pauses", "Goal", "Unit", "Rate", "Topic", "Column of x", "Scale to fit"} & opened.labels()
+    visible = opened.page.visitor.pictures._always[-1]
+    assert not visible.visible
+    opened.page.claim(opened["Cancel"], True)
+    assert not opened.takes.visible and visible.visible and opened["Learn"].disabled
+    assert {"Smooth jitter", "Use this take"}.isdisjoint(opened.labels())
+    assert opened.page.session.scenario.task == "draw_s"
+
+
+def test_switches_and_takes_are_chosen(opened):
+    opened.add("b.zip", zipped(a=csv(), b=csv(jitter=0.002), c=csv(GOAL + np.array([-0.3, 0.0, 0.2]))))
+    smooth = np.array(opened.takes.learned[1].node.points)
+    opened.choose("Smooth jitter", False)
+    rough = np.array(opened.takes.learned[1].node.points)
+    assert np.abs(np.diff(rough[:, 0], axis=0)).sum() > 1.2 * np.abs(np.diff(smooth[:, 0], axis=0)).sum()
+    assert opened["Smooth jitter"].value is False  # it stays, though nothing is done
+    opened.choose("Take", "2 · b")
+    assert opened.takes.name.text == "b"
+    opened.choose("Use this take", False)
+    assert opened.num_drawn == 1
+    opened.choose("Take", "1 · a")
+    assert opened["Use this take"].value is True
+    opened.choose("Use this take", False)
+    opened.choose("Take", "3 · c")
+    assert opened.num_drawn == 1 and not opened["Learn"].disabled  # the one that ended elsewhere
+    opened.choose("Use this take", False)
+    assert opened.num_drawn == 0 and opened["Learn"].disabled
+
+
+def test_a_click_learns_what_is_seen_and_undo_goes_back(opened):
+    opened.add("a.zip", zipped(a=csv(jitter=0.002), b=csv(), c=csv()))
+    opened.choose("Smooth jitter", False)
+    opened.page.claim(opened["Learn"], True)
+    opened.done()
+    session, dropdown = opened.page.session, opened["Task"]
+    task = session.task
+    assert session.scenario.task == task.name == "own_data_1" and len(task.demonstrations) == 3
+    assert not task.preparation.smooth_jitter
+    assert dropdown.value == "Your data" and dropdown.options == (*(e.title for e in TASKS.values()), "Your data")
+    assert not opened.takes.visible and opened["Learn"].disabled
+    session.undo()
+    assert session.scenario.task == "draw_s" and dropdown.value == "Draw S"
+    session.redo()
+    assert dropdown.value == "Your data"
+    opened.choose("Task", "Draw J")
+    opened.choose("Task", "Your data")
+    assert session.scenario.task == task.name
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("a.exe", b"MZ", "a.exe"),
+        ("a.npz", b"no archive", "a.npz"),
+        ("a.zip", zipped(), "a.zip"),
+        ("a.csv", b"t,x,y,z\n0,0,0,0\n1,nan,0,0\n", "nan"),
+        ("a.csv", b"", "empty"),
+    ],
+)
+def test_what_cannot_be_read_is_one_line_and_what_was_open_stays(opened, name, content, said):
+    opened.add("good.csv", csv())
+    opened.add(name, content)
+    assert len(opened.told) == 1 and said in opened.told[0] and "\n" not in opened.told[0]
+    assert opened.num_drawn == 1 and opened.takes.visible
+    opened.add("more.csv", csv())
+    assert opened.num_drawn == 2 and len(opened.told) == 1
+
+
+def test_more_than_a_visitor_may_hold_is_refused(opened):
+    opened.add("good.csv", csv())
+    opened.add("large.csv", bytes(50 * 10**6))
+    assert opened.told == [
+        "large.csv: files: found 50.0 MB in all; accepted: at most 50 MB; the command line takes more"
+    ]
+    assert opened.num_drawn == 1
+
+
+def test_what_is_not_clear_is_asked_for_and_answered(opened):
+    opened.add("mm.csv", csv(size=1000.0, timed=False).replace(b"x,y,z", b"a,b,c"))
+    assert {"Unit", "Rate", "Column of x", "Column of times"} <= opened.labels()
+    assert (opened["Unit"].value, opened["Rate"].value, opened["Column of y"].value) == ("mm", "50 Hz", "b")
+    np.testing.assert_allclose(opened.takes.goal.position, GOAL, atol=0.01)
+    opened.choose("Unit", "cm")
+    np.testing.assert_allclose(opened.takes.goal.position, 10 * GOAL, atol=0.1)
+    opened.choose("Unit", "m")  # 200 m
+    assert len(opened.told) == 1 and "millimetres" in opened.told[0]
+    opened.choose("Unit", "mm")
+    opened.choose("Rate", "100 Hz")
+    opened.choose("Column of y", "c")
+    opened.choose("Column of z", "b")
+    np.testing.assert_allclose(opened.takes.goal.position, GOAL[[0, 2, 1]], atol=0.01)
+    assert opened["Rate"].value == "100 Hz" and opened["Unit"].value == "mm"
+
+
+def test_several_goals_are_told_and_one_is_chosen(opened):
+    far = GOAL + np.array([0.0, 0.1, 0.3])
+    opened.add("a.zip", zipped(a=csv(), b=csv(far), c=csv(), d=csv(far)))
+    assert opened["Goal"].options[0].startswith("1 · ") and len(opened["Goal"].options) == 2
+    np.testing.assert_allclose(opened.takes.goal.position, GOAL, atol=0.01)
+    opened.choose("Goal", opened["Goal"].options[1])
+    np.testing.assert_allclose(opened.takes.goal.position, far, atol=0.01)
+    assert opened.num_drawn == 2
+
+
+def test_what_the_arm_cannot_reach_is_scaled_if_that_is_wanted(opened):
+    opened.add("a.zip", zipped(a=csv(3 * GOAL), b=csv(3 * GOAL)))
+    assert opened["Scale to fit"].value is False
+    opened.choose("Scale to fit", True)
+    assert 0 < np.linalg.norm(opened.takes.goal.position) < 2 * np.linalg.norm(GOAL)
+    assert opened["Scale to fit"].value is True
+
+
+@pytest.mark.parametrize("claim", [math.nan, -1, 2**70, None, "", "x" * 10_000, "1 · nobody", [], {}, True, 3.5])
+def test_forged_values_are_refused(opened, claim):
+    opened.add(
+        "a.zip", zipped(a=csv(timed=False, size=1000.0, jitter=0.002), b=csv(GOAL + 0.2, timed=False, size=1000.0))
+    )
+    shown = [handle for handle in opened.page.inputs if handle.visible]
+    labels = {"Take", "Use this take", "Unit", "Rate", "Goal", "Smooth jitter"}
+    assert labels <= {handle.label for handle in shown}
+    for handle in shown:
+        if handle.label in labels and not isinstance(handle, viser.GuiCheckboxHandle):  # viser makes booleans for those
+            before = handle.value
+            opened.page.claim(handle, claim)
+            opened.done()
+            assert handle.value == before, handle.label
+    hidden = [
+        handle
+        for handle in opened.page.inputs
+        if not handle.visible and handle.label in ("Cut pauses", "Topic", "Column of x")
+    ]
+    for handle in hidden:
+        before = handle.value
+        opened.page.claim(handle, False)
+        opened.done()
+        assert handle.value == before and not handle.visible
+    assert opened.num_drawn == 1 and opened.told == []
+
+
+def test_a_file_for_a_folder_that_is_hidden_is_not_read(opened):
+    upload = opened["Choose files, or drop them here"]
+    opened.page.claim(opened["Cancel"], True)
+    opened.page.claim(upload, viser.UploadedFile("a.csv", csv()))
+    opened.done()
+    assert not opened.takes.visible and opened.told == []
+
+
+def test_another_task_ends_what_is_open(opened):
+    opened.add("a.csv", csv())
+    opened.choose("Task", "Draw J")
+    assert not opened.takes.visible and opened.page.session.scenario.task == "draw_j"
+
+
+def test_two_visitors_open_at_the_same_instant_and_each_sees_its_own(server, robot, opened):
+    other = Page(server, robot)
+    try:
+        other.claim(next(h for h in reversed(other.inputs) if h.label.startswith("Open your")), True)
+        upload = next(handle for handle in reversed(other.inputs) if handle.label.startswith("Choose files"))
+        first_upload = next(handle for handle in opened.page.inputs if handle.label.startswith("Choose files"))
+        opened.page.claim(first_upload, viser.UploadedFile("a.csv", csv()))
+        other.claim(upload, viser.UploadedFile("b.zip", zipped(b=csv(), c=csv())))
+        opened.done()
+        for lane in (LANE, SEEING):
+            assert other.session.jobs.wait_idle(lane, PATIENCE)
+        wait_until(lambda: opened.takes.visible and other.visitor.pictures._takes.visible)
+        assert opened.takes.name.text == "a" and other.visitor.pictures._takes.name.text == "b"
+    finally:
+        other.close()
+
+
+def test_every_kind_of_finding_that_can_be_switched_has_a_field():
+    fields = PreparationSettings.__dataclass_fields__
+    assert all(name in fields and fields[name].default is True for name, *_ in SWITCHES.values())
+    assert len(LIGHT.takes) > 5 and opening.FORMATS.endswith("zip")
