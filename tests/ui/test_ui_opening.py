@@ -191,6 +191,16 @@ def test_what_is_not_clear_is_asked_for_and_answered(opened):
     assert opened["Rate"].value == "100 Hz" and opened["Unit"].value == "mm"
 
 
+def test_three_columns_without_names_can_be_told(opened):
+    u = np.linspace(0, 1, 100)
+    rows = np.column_stack([0.3 * u, -0.5 + 0.1 * np.sin(3 * u), 0.3 + 0.1 * u**2])  # the first is as even as times are
+    opened.add("a.csv", "\n".join(",".join(f"{value:.6f}" for value in row) for row in rows).encode())
+    assert opened["First column"].value == "times" and "Rate" not in opened.labels()
+    opened.choose("First column", opened["First column"].options[1])
+    np.testing.assert_allclose(opened.takes.goal.position, rows[-1], atol=1e-4)
+    assert opened["Rate"].value == "20 Hz"
+
+
 def test_several_goals_are_told_and_one_is_chosen(opened):
     far = GOAL + np.array([0.0, 0.1, 0.3])
     opened.add("a.zip", zipped(a=csv(), b=csv(far), c=csv(), d=csv(far)))
@@ -250,14 +260,14 @@ def test_another_task_ends_what_is_open(opened):
     assert not opened.takes.visible and opened.page.session.scenario.task == "draw_j"
 
 
-def test_two_visitors_open_at_the_same_instant_and_each_sees_its_own(server, robot, opened):
-    other = Page(server, robot)
+def test_two_visitors_open_at_the_same_instant_and_each_sees_its_own(robot, opened):
+    beside = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    other = Page(beside, robot)
     try:
-        other.claim(next(h for h in reversed(other.inputs) if h.label.startswith("Open your")), True)
-        upload = next(handle for handle in reversed(other.inputs) if handle.label.startswith("Choose files"))
-        first_upload = next(handle for handle in opened.page.inputs if handle.label.startswith("Choose files"))
-        opened.page.claim(first_upload, viser.UploadedFile("a.csv", csv()))
-        other.claim(upload, viser.UploadedFile("b.zip", zipped(b=csv(), c=csv())))
+        other.claim(other["Open your demonstrations"], True)
+        label = "Choose files, or drop them here"
+        opened.page.claim(opened[label], viser.UploadedFile("a.csv", csv()))
+        other.claim(other[label], viser.UploadedFile("b.zip", zipped(b=csv(), c=csv())))
         opened.done()
         for lane in (LANE, SEEING):
             assert other.session.jobs.wait_idle(lane, PATIENCE)
@@ -265,6 +275,7 @@ def test_two_visitors_open_at_the_same_instant_and_each_sees_its_own(server, rob
         assert opened.takes.name.text == "a" and other.visitor.pictures._takes.name.text == "b"
     finally:
         other.close()
+        beside.stop()
 
 
 def test_every_kind_of_finding_that_can_be_switched_has_a_field():

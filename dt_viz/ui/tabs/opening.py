@@ -286,9 +286,8 @@ class OpenPanel:
         questions = opened.recordings.questions
         for about in ("reading", "topic"):
             question = questions.get(about)
-            named = READINGS if about == "reading" else {}
-            choices = () if question is None else tuple(named.get(choice, choice) for choice in question.choices)
-            self._offer(about, choices, "" if question is None else named.get(question.answer, question.answer))
+            choices = () if question is None else tuple(READINGS.get(choice, choice) for choice in question.choices)
+            self._offer(about, choices, "" if question is None else READINGS.get(question.answer, str(question.answer)))
         question = questions.get("columns")
         for axis in AXES:
             choices = () if question is None else (NO_COLUMN, *question.choices)
