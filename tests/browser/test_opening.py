@@ -46,7 +46,8 @@ def test_six_files_chosen_at_once_are_seen_and_learned_by_a_click_and_undo_goes_
     close_notices(page)
     press(page.get_by_role("button", name="Learn", exact=True))
     wait_until(lambda: visitor.shown is not None and visitor.shown.task.title == "Your data", "the learned motion")
-    assert len(visitor.shown.task.demonstrations) == 5 and not takes.visible
+    assert len(visitor.shown.task.demonstrations) == 5
+    wait_until(lambda: not takes.visible, "the learned motion in place of the takes")
     assert visitor.session.wait_idle(PATIENCE)
     assert page.get_by_role("textbox", name="Task").count() or page.locator("input[value='Your data']").count()
     press(page.get_by_role("button", name="Undo", exact=True))

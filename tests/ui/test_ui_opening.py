@@ -3,15 +3,17 @@
 import io
 import math
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import viser  # noqa: TID251 - forges what a browser sends
-from pages import PATIENCE, Page, wait_until
+from pages import PATIENCE, Page, frame_of, wait_until
 
 from dt_viz.files import uploads
 from dt_viz.learning.inspection import PreparationSettings
 from dt_viz.scenario.tasks import TASKS
+from dt_viz.session.progress import Progress
 from dt_viz.ui.panel import LANE as TASK_LANE
 from dt_viz.ui.scene.palette import LIGHT
 from dt_viz.ui.tabs import opening
@@ -136,7 +138,13 @@ def test_a_click_learns_what_is_seen_and_undo_goes_back(opened):
     assert session.scenario.task == task.name == "own_data_1" and len(task.demonstrations) == 3
     assert not task.preparation.smooth_jitter
     assert dropdown.value == "Your data" and dropdown.options == (*(e.title for e in TASKS.values()), "Your data")
-    assert not opened.takes.visible and opened["Learn"].disabled
+    assert opened["Learn"].disabled and opened.takes.visible  # until the motion is there
+    visitor = opened.page.visitor
+    learning = Progress(session.scenario, shown=frame_of(session.scenario), learning=(0.5, "half"))
+    visitor.tell(learning)
+    assert opened.takes.visible
+    visitor.tell(replace(learning, learning=None))
+    assert not opened.takes.visible
     session.undo()
     assert session.scenario.task == "draw_s" and dropdown.value == "Draw S"
     session.redo()
