@@ -118,12 +118,20 @@ def answer_recordings(
             | {"timed": t.is_timed}
             for t in found.takes
         ],
-        "notes": found.notes,
+        "notes": _grouped(found.notes),
         "refused": found.refused,
         "asked": {about: asdict(question) for about, question in found.questions.items()},
     }
     arrays = [(t.times, _values(t), *([] if t.orientations is None else [t.orientations])) for t in found.takes]
     return (np.array(json.dumps(told)), *(array for each in arrays for array in each)), ()
+
+
+def _grouped(notes: Sequence[str]) -> list[str]:
+    """Notes that each name their file, those that are alike of several files as one."""
+    files: dict[str, list[str]] = {}
+    for name, _, note in (note.partition(": ") for note in notes):
+        files.setdefault(note, []).append(name)
+    return [f"{names[0]}{f' and {len(names) - 1} more' * (len(names) > 1)}: {note}" for note, names in files.items()]
 
 
 def _values(take: Take) -> np.ndarray:
@@ -141,7 +149,8 @@ def _read_upload(
     if name.suffix.lower() == ARCHIVE:
         try:
             with parsing(DataError, name, "file", "a zip archive of files of recorded motions"):
-                found, sources = replace(found, notes=(*found.notes, *_unpack(content, folder))), _sources(folder)
+                unused, sources = _unpack(content, folder), _sources(folder)
+                found = replace(found, notes=(*found.notes, *(f"{name.name}: {note}" for note in unused)))
         except DataError as error:
             return replace(found, refused=(*found.refused, str(error)))
     for label, read in sources:
@@ -166,7 +175,7 @@ def _unpack(content: bytes, folder: Path) -> tuple[str, ...]:
     if not members:
         raise FormatError("archive", "no files", "files of recorded motions")
     unused = [name for name in others if not name.endswith(("metadata.yaml", ".zstd"))]
-    return (f"not read: {', '.join(unused)[:200]}",) if unused else ()
+    return (f"not read are {', '.join(unused)[:200]}",) if unused else ()
 
 
 def _is_hidden(name: str) -> bool:

@@ -116,6 +116,7 @@ def preview(recordings: Recordings, choices: Choices, robot: Robot) -> Preview:
         takes = [replace(take, units={"length": UNITS[choices.unit][1]} | take.units) for take in takes]
     is_open = any(take.positions is not None and "length" not in take.units for take in recordings.takes)
     takes, note = in_si_units(takes, len(robot.joint_names))
+    note = note.replace("unit=…", "“Unit”")
     used, refused = _usable(takes, robot)
     recognised = next((unit for unit in LENGTHS if note.startswith(f"taken as in {unit} ")), "m")
     wide = max(float(np.abs(own.positions).max()) for own in used) > robot.reach

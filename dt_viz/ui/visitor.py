@@ -69,8 +69,8 @@ class Visitor(Display):
         self.client = client
         self.shown: Frame | None = None
         """The last drawn frame."""
-        self._previews = False
-        """Whether takes are seen that are not learned yet."""
+        self._previews = self._learns = False
+        """Whether takes are seen that are not learned yet, and whether they are being learned."""
         self._dress(LIGHT)
         client.gui.set_panel_label("DT-Viz")
         with client.atomic():
@@ -130,14 +130,19 @@ class Visitor(Display):
 
     def tell(self, progress: Progress) -> None:
         self._panel.tell(progress)
+        if self._learns and (progress.failed or not progress.stale):
+            self._preview(None, 0)  # what was seen is learned, or will not be
 
     def close(self) -> None:
         """Stop all work: the visitor has left."""
         let_go(self)
         self.session.close()
 
-    def _preview(self, seen: Preview | None, number: int) -> None:
-        """Show takes that are not learned yet in place of the motion; None ends it."""
+    def _preview(self, seen: Preview | None, number: int | None) -> None:
+        """Show takes that are not learned yet in place of the motion; see `ui.tabs.opening.Show`."""
+        self._learns = number is None
+        if number is None:
+            return
         begins, before = seen is not None, self._previews
         self._previews = begins
         with self.client.atomic():

@@ -4,6 +4,7 @@ import io
 import json
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -83,9 +84,15 @@ def test_a_file_that_cannot_be_read_is_named_and_the_others_are_read():
     assert all("found " in line and "accepted: " in line and "\n" not in line for line in found.refused)
 
 
+def test_what_is_not_used_of_several_files_is_said_once():
+    content = table((*HEADER, "current"), [TIMES, *path_of().T, TIMES])
+    found = read(*((f"{k}.csv", content) for k in range(3)))
+    assert found.notes == ("0.csv and 2 more: columns current are not used",)
+
+
 def test_what_of_an_archive_is_no_recording_is_said():
     found = read(("all.zip", zipped({"a/notes.md": b"# day 1", "a/one.csv": TIMED, "a/.hidden.csv": b"?"})))
-    assert len(found.takes) == 1 and found.notes == ("not read: a/notes.md",)
+    assert len(found.takes) == 1 and found.notes == ("all.zip: not read are a/notes.md",)
 
 
 def test_columns_that_are_not_clear_are_guessed_and_asked_and_answers_are_for_files_that_ask():
@@ -149,15 +156,16 @@ def test_the_topic_of_a_bag_is_asked_for(tmp_path):
     for sent in (("take.mcap", files[name]), ("folder.zip", zipped(files))):
         found = read(sent)
         assert found.questions["topic"].choices == ("/hand", "/other") and found.questions["topic"].answer == "/hand"
-        np.testing.assert_allclose(found.takes[0].positions, path_of())
-        np.testing.assert_allclose(read(sent, answers={"topic": "/other"}).takes[0].positions, -path_of())
+        np.testing.assert_array_equal(found.takes[0].positions, path_of())
+        np.testing.assert_array_equal(read(sent, answers={"topic": "/other"}).takes[0].positions, -path_of())
 
 
 @pytest.mark.parametrize("key", ["b", "data"])
 def test_complex_numbers_are_refused_not_left_out(key):
     """A take of them went without a word where others were in the file."""
     file = io.BytesIO()
-    np.savez(file, a=path_of(), **{key: path_of() + 1j})
+    save: Any = np.savez
+    save(file, a=path_of(), **{key: path_of() + 1j})
     (refused,) = read(("a.csv", TIMED), ("c.npz", file.getvalue())).refused
     assert refused.startswith("c.npz: ") and f"'{key}" in refused and "complex" in refused
 

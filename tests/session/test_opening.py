@@ -24,6 +24,7 @@ RNG = np.random.default_rng(3)
 
 def take(name="a", positions=None, times=None, joints=None, units=None, **options):
     values = joints if positions is None else positions
+    assert values is not None
     times = 0.01 * np.arange(len(values)) if times is None else times
     names = () if joints is None else tuple(f"joint{k + 1}" for k in range(joints.shape[1]))
     return Take(name, times, positions, None, joints, names, lambda row: f"at sample {row + 1}", units or {}, **options)
@@ -140,7 +141,7 @@ def test_of_several_goals_one_is_chosen_and_it_is_said_which(robot):
     for goal, end in enumerate(ends):
         seen = preview(recordings, Choices(goal=goal), robot)
         assert len(seen.goals) == 2 and seen.task is not None and "'0', '2' at" in seen.goals[0]
-        np.testing.assert_allclose(seen.goal, end)
+        np.testing.assert_array_equal(seen.goal, end)
         assert [one.learned is not None for one in seen.takes] == [k % 2 == goal for k in range(4)]
     assert preview(recordings, Choices(goal=9), robot).task is not None
 

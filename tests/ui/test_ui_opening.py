@@ -3,15 +3,17 @@
 import io
 import math
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import viser  # noqa: TID251 - forges what a browser sends
-from pages import PATIENCE, Page, wait_until
+from pages import PATIENCE, Page, frame_of, wait_until
 
 from dt_viz.files import uploads
 from dt_viz.learning.inspection import PreparationSettings
 from dt_viz.scenario.tasks import TASKS
+from dt_viz.session.progress import Progress
 from dt_viz.ui.panel import LANE as TASK_LANE
 from dt_viz.ui.scene.palette import LIGHT
 from dt_viz.ui.tabs import opening
@@ -136,7 +138,13 @@ def test_a_click_learns_what_is_seen_and_undo_goes_back(opened):
     assert session.scenario.task == task.name == "own_data_1" and len(task.demonstrations) == 3
     assert not task.preparation.smooth_jitter
     assert dropdown.value == "Your data" and dropdown.options == (*(e.title for e in TASKS.values()), "Your data")
-    assert not opened.takes.visible and opened["Learn"].disabled
+    assert opened["Learn"].disabled and opened.takes.visible  # until the motion is there
+    visitor = opened.page.visitor
+    learning = Progress(session.scenario, shown=frame_of(session.scenario), learning=(0.5, "half"))
+    visitor.tell(learning)
+    assert opened.takes.visible
+    visitor.tell(replace(learning, learning=None))
+    assert not opened.takes.visible
     session.undo()
     assert session.scenario.task == "draw_s" and dropdown.value == "Draw S"
     session.redo()
@@ -189,6 +197,16 @@ def test_what_is_not_clear_is_asked_for_and_answered(opened):
     opened.choose("Column of z", "b")
     np.testing.assert_allclose(opened.takes.goal.position, GOAL[[0, 2, 1]], atol=0.01)
     assert opened["Rate"].value == "100 Hz" and opened["Unit"].value == "mm"
+
+
+def test_three_columns_without_names_can_be_told(opened):
+    u = np.linspace(0, 1, 100)
+    rows = np.column_stack([0.3 * u, -0.5 + 0.1 * np.sin(3 * u), 0.3 + 0.1 * u**2])  # the first is as even as times are
+    opened.add("a.csv", "\n".join(",".join(f"{value:.6f}" for value in row) for row in rows).encode())
+    assert opened["First column"].value == "times" and "Rate" not in opened.labels()
+    opened.choose("First column", opened["First column"].options[1])
+    np.testing.assert_allclose(opened.takes.goal.position, rows[-1], atol=1e-4)
+    assert opened["Rate"].value == "20 Hz"
 
 
 def test_several_goals_are_told_and_one_is_chosen(opened):
@@ -250,14 +268,14 @@ def test_another_task_ends_what_is_open(opened):
     assert not opened.takes.visible and opened.page.session.scenario.task == "draw_j"
 
 
-def test_two_visitors_open_at_the_same_instant_and_each_sees_its_own(server, robot, opened):
-    other = Page(server, robot)
+def test_two_visitors_open_at_the_same_instant_and_each_sees_its_own(robot, opened):
+    beside = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    other = Page(beside, robot)
     try:
-        other.claim(next(h for h in reversed(other.inputs) if h.label.startswith("Open your")), True)
-        upload = next(handle for handle in reversed(other.inputs) if handle.label.startswith("Choose files"))
-        first_upload = next(handle for handle in opened.page.inputs if handle.label.startswith("Choose files"))
-        opened.page.claim(first_upload, viser.UploadedFile("a.csv", csv()))
-        other.claim(upload, viser.UploadedFile("b.zip", zipped(b=csv(), c=csv())))
+        other.claim(other["Open your demonstrations"], True)
+        label = "Choose files, or drop them here"
+        opened.page.claim(opened[label], viser.UploadedFile("a.csv", csv()))
+        other.claim(other[label], viser.UploadedFile("b.zip", zipped(b=csv(), c=csv())))
         opened.done()
         for lane in (LANE, SEEING):
             assert other.session.jobs.wait_idle(lane, PATIENCE)
@@ -265,6 +283,7 @@ def test_two_visitors_open_at_the_same_instant_and_each_sees_its_own(server, rob
         assert opened.takes.name.text == "a" and other.visitor.pictures._takes.name.text == "b"
     finally:
         other.close()
+        beside.stop()
 
 
 def test_every_kind_of_finding_that_can_be_switched_has_a_field():

@@ -63,8 +63,9 @@ class Opened:
     choices: Choices = field(default_factory=Choices)
 
 
-Show = Callable[[Preview | None, int], None]
-"""Function that shows a preview in the scene, and which take of it is chosen; None ends it."""
+Show = Callable[[Preview | None, int | None], None]
+"""Function that shows a preview in the scene, and which take of it is chosen. No preview ends it: at once or, with no
+take, when what is wanted is shown."""
 
 
 class OpenPanel:
@@ -143,14 +144,14 @@ class OpenPanel:
         self.folder.visible, self.controls["open"].handle.visible = True, False
         self._bindings.session.jobs.submit("ready", make_ready)  # a lane of its own: that of files must be free for one
 
-    def close(self) -> None:
-        """Let go of what is open, and show what was shown before. Nothing is done while nothing is open."""
+    def close(self, *, learns: bool = False) -> None:
+        """Let go of what is open, and show what was shown before, or what it `learns` once that is known."""
         with self._changing:
             seen, self._seen, self._opened = self._seen, None, Opened()
             self.folder.visible, self.controls["open"].handle.visible = False, True
             self._draw()
             if seen is not None:
-                self._show(None, 0)
+                self._show(None, None if learns else 0)
 
     def load(self, name: str, content: bytes) -> None:
         """Have a file added to what is open; say why that cannot be. Nothing is done while the folder is hidden."""
@@ -255,7 +256,7 @@ class OpenPanel:
         with self._changing:
             task = None if self._seen is None else self._seen.task
             if task is not None:
-                self.close()
+                self.close(learns=True)
                 self._learn(self._bindings.session, task)
 
     # --- what is shown ---
@@ -286,9 +287,8 @@ class OpenPanel:
         questions = opened.recordings.questions
         for about in ("reading", "topic"):
             question = questions.get(about)
-            named = READINGS if about == "reading" else {}
-            choices = () if question is None else tuple(named.get(choice, choice) for choice in question.choices)
-            self._offer(about, choices, "" if question is None else named.get(question.answer, question.answer))
+            choices = () if question is None else tuple(READINGS.get(choice, choice) for choice in question.choices)
+            self._offer(about, choices, "" if question is None else READINGS.get(question.answer, str(question.answer)))
         question = questions.get("columns")
         for axis in AXES:
             choices = () if question is None else (NO_COLUMN, *question.choices)

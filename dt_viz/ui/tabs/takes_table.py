@@ -31,7 +31,7 @@ def seen_html(seen: Preview, number: int) -> str:
     told = [f"<div style='color:{ink(COLOURS[Severity.WARNING][0])}'>{html.escape(text)}</div>" for text in alarms]
     told += [f"<div>{html.escape(note)}</div>" for note in seen.notes]
     found = {finding.kind for take in seen.takes if take.learned is not None for finding in take.inspection.findings}
-    heads = [kind for kind in HEADS if kind in found]
+    heads: list[FindingKind] = [kind for kind in HEADS if kind in found]
     rows = "".join(_row(k, take, heads, chosen=k == number) for k, take in enumerate(seen.takes))
     named = [("time<br>s", "duration"), ("<br>n", "samples"), ("rate<br>Hz", "samples a second")]
     titles = "".join(

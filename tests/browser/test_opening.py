@@ -1,0 +1,66 @@
+"""A visitor's own recordings in a real browser: several files are chosen at once, or dropped, seen, and learned."""
+
+import numpy as np
+import pytest
+from browsing import PATIENCE, close_notices, close_page, open_page, press, wait_until
+from chromium import needs_chromium
+
+pytestmark = [pytest.mark.browser, needs_chromium]
+RNG = np.random.default_rng(5)
+DROP = """files => {
+    const transfer = new DataTransfer();
+    for (const [name, text] of files) transfer.items.add(new File([text], name));
+    for (const type of ['dragover', 'drop'])
+        document.body.dispatchEvent(new DragEvent(type, {dataTransfer: transfer, bubbles: true, cancelable: true}));
+}"""
+
+
+def take(goal=(0.2, -0.45, 0.3)):
+    u = np.linspace(0, 1, 150)
+    start = np.array([-0.2, -0.4, 0.2]) + RNG.normal(scale=0.01, size=3)
+    path = start + (3 * u**2 - 2 * u**3)[:, None] * (np.array(goal) - start) + RNG.normal(scale=0.001, size=(150, 3))
+    rows = np.column_stack([3 * u, path])
+    return "\n".join(["timestamp,pos_x,pos_y,pos_z", *(",".join(f"{v:.5f}" for v in row) for row in rows)]).encode()
+
+
+@pytest.fixture(name="tab")
+def _tab(browser, server):
+    page, visitor = open_page(browser, server, (720, 900))
+    yield page, visitor
+    close_page(page, server, visitor)
+
+
+def test_six_files_chosen_at_once_are_seen_and_learned_by_a_click_and_undo_goes_back(tab):
+    page, visitor = tab
+    press(page.get_by_role("button", name="Open your demonstrations"))
+    page.get_by_role("button", name="Choose files, or drop them here").wait_for()
+    files = [{"name": f"pour_{k}.csv", "mimeType": "text/csv", "buffer": take()} for k in range(5)]
+    files.append({"name": "astray.csv", "mimeType": "text/csv", "buffer": take((-0.1, -0.5, 0.5))})
+    wait_until(lambda: page.locator("input[type=file]").first.evaluate("input => input.multiple"), "the script")
+    page.locator("input[type=file]").first.set_input_files(files)
+    page.get_by_text("pour_4").first.wait_for()
+    assert page.get_by_text("it is left out").count() == 1 and page.get_by_text("astray").count() >= 1
+    takes = visitor.pictures._takes
+    wait_until(lambda: takes.visible, "the takes in the scene")
+    assert sum(len(lines.node.points) > 0 for lines in takes.learned) == 5
+    close_notices(page)
+    press(page.get_by_role("button", name="Learn", exact=True))
+    wait_until(lambda: visitor.shown is not None and visitor.shown.task.title == "Your data", "the learned motion")
+    assert len(visitor.shown.task.demonstrations) == 5
+    wait_until(lambda: not takes.visible, "the learned motion in place of the takes")
+    assert visitor.session.wait_idle(PATIENCE)
+    assert page.get_by_role("textbox", name="Task").count() or page.locator("input[value='Your data']").count()
+    press(page.get_by_role("button", name="Undo", exact=True))
+    wait_until(lambda: visitor.shown is not None and visitor.shown.scenario.task == "draw_s", "the task before")
+
+
+def test_files_dropped_on_the_page_are_seen_and_cancel_goes_back(tab):
+    page, visitor = tab
+    press(page.get_by_role("button", name="Open your demonstrations"))
+    wait_until(lambda: page.locator("input[type=file]").first.evaluate("input => input.multiple"), "the script")
+    page.evaluate(DROP, [[f"drop_{k}.csv", take().decode()] for k in range(2)])
+    page.get_by_text("drop_1").first.wait_for()
+    wait_until(lambda: visitor.pictures._takes.visible, "the takes in the scene")
+    press(page.get_by_role("button", name="Cancel"))
+    wait_until(lambda: not visitor.pictures._takes.visible, "the motion again")
+    assert visitor.session.scenario.task == "draw_s"
