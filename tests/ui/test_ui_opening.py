@@ -14,7 +14,7 @@ from dt_viz.files import uploads
 from dt_viz.learning.inspection import PreparationSettings
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.progress import Progress
-from dt_viz.ui.panel import LANE as TASK_LANE
+from dt_viz.session.session import CHOICES
 from dt_viz.ui.scene.palette import LIGHT
 from dt_viz.ui.tabs import opening
 from dt_viz.ui.tabs.from_file import LANE
@@ -66,7 +66,7 @@ class Opening:
         self.done()
 
     def done(self):
-        for lane in (LANE, SEEING, TASK_LANE):
+        for lane in (LANE, SEEING, CHOICES):
             assert self.page.session.jobs.wait_idle(lane, PATIENCE)
 
     @property
