@@ -68,7 +68,7 @@ def on_urdf(robot, q, ball):
 
 def test_clearance_is_that_of_the_urdfs_shapes_whatever_the_spheres_are_that_the_arm_avoids_with(robot, engine, fits):
     task = engine.task(TASK)
-    ball = Sphere(as_point(task.mean_path[50] + [0, 0, 0.06]), 0.1)
+    ball = Sphere(as_point(task.mean_path[50] + [0, 0, 0.14]), 0.1)
     place = measured(engine, task, ArmAvoidance(ball))
     q = np.concatenate([motion.q for motion in place.motions.values()])[::5]
     assert place.without < 0 and place.clearance > 9e-3
@@ -80,7 +80,7 @@ def test_clearance_is_that_of_the_urdfs_shapes_whatever_the_spheres_are_that_the
     place = measured(Engine(TASKS, fits, deceived), task, ArmAvoidance(ball))
     q = np.concatenate([motion.q for motion in place.motions.values()])[::5]
     assert deceived.body.clearance(deceived, q, ball).min() > 8e-3  # so it believes
-    assert place.clearance < 5e-3 and on_urdf(robot, q, ball) == pytest.approx(place.clearance, abs=5e-3)
+    assert place.clearance < 5e-3 and on_urdf(robot, q, ball) == pytest.approx(place.clearance, abs=2e-3)
 
 
 def test_the_command_has_a_row_for_each_arm_and_writes_what_it_is_made_from(tmp_path, capsys, monkeypatch):
