@@ -19,8 +19,8 @@ OWN_FOLDER = Path(tempfile.mkdtemp(prefix="dt-viz-tests-", dir=os.environ.get("P
 atexit.register(shutil.rmtree, OWN_FOLDER, ignore_errors=True)
 tempfile.tempdir = os.environ["TMPDIR"] = str(OWN_FOLDER / "tmp")
 os.environ["XDG_CACHE_HOME"] = str(OWN_FOLDER / "cache")
-for folder in (tempfile.tempdir, os.environ["XDG_CACHE_HOME"]):
-    Path(folder).mkdir()
+for folder in (tempfile.tempdir, os.environ["XDG_CACHE_HOME"] + "/dt-viz"):
+    Path(folder).mkdir(parents=True)
 
 import leftovers
 import pytest

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,12 +39,7 @@ class _Planner(MPNetPlanner):
         """Find a free way between two postures; the straight line where there is none, or no time is left."""
         if not (search.free(start, start) and search.free(goal, goal)):
             return [start, goal]
-        with _one_at_a_time:
-            watch = _Watch(search, time.monotonic() + self.seconds)
-            found = _rrt_connect(watch, search.surroundings.robot, start, goal)
-        if watch.raised is not None:
-            raise watch.raised  # not within OMPL's frames, which its traceback would keep
-        return found or [start, goal]
+        return rrt_connect(search.free, search.surroundings.robot, start, goal, self.seconds) or [start, goal]
 
 
 class MPNetRRT(MPNet):
@@ -66,8 +62,27 @@ class MPNetRRT(MPNet):
         return _Planner(problem, self.model(problem), self.seconds)
 
 
-def _rrt_connect(watch: _Watch, robot: Robot, start: Array, goal: Array) -> list[Array]:
-    """Find a free way, seeded; empty if none was found in time."""
+def rrt_connect(
+    free: Callable[[Array, Array], bool], robot: Robot, start: Array, goal: Array, seconds: float
+) -> list[Array]:
+    """Find a free way between two postures (n,), rad, seeded; empty if none was found in time.
+
+    Args:
+        free: decides whether the straight line between two postures is free.
+        robot: the arm.
+        start: where it begins.
+        goal: where it ends.
+        seconds: the time that it may take.
+    """
+    with _one_at_a_time:
+        watch = _Watch(free, time.monotonic() + seconds)
+        found = _planned(watch, robot, start, goal)
+    if watch.raised is not None:
+        raise watch.raised  # not within OMPL's frames, which its traceback would keep
+    return found
+
+
+def _planned(watch: _Watch, robot: Robot, start: Array, goal: Array) -> list[Array]:
     from ompl import base, geometric, util  # noqa: PLC0415  # pyright: ignore[reportMissingImports] - an extra
 
     class Motions(base.MotionValidator):
@@ -114,8 +129,8 @@ def _bounds(bounds: Any, robot: Robot, start: Array, goal: Array) -> Any:  # noq
 class _Watch:
     """What the planner calls back: exceptions are kept, as they must not pass through OMPL's loops."""
 
-    def __init__(self, search: Search, deadline: float) -> None:
-        self._search, self._deadline = search, deadline
+    def __init__(self, free: Callable[[Array, Array], bool], deadline: float) -> None:
+        self._free, self._deadline = free, deadline
         self.raised: BaseException | None = None
 
     def is_over(self) -> bool:
@@ -127,7 +142,7 @@ class _Watch:
         if self.is_over():
             return False
         try:
-            return self._search.free(start, end)
+            return self._free(start, end)
         except BaseException as error:
             self.raised = error
             return False

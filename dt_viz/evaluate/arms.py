@@ -6,8 +6,9 @@ Each arm follows the tasks that ship with DT-Viz, placed in its reach. A ball's 
 of a random link that moves, in a random posture of a random task's motions; it is nearer to the arm there than the
 margin. Clearance is coal's distance from the collision shapes of the URDF, also between samples; the spheres that the
 avoidance computes with are not used. A ball that the arm cannot possibly pass is drawn again, and counted: one that is
-nearer than the margin to a link that no joint carries away, or to the arm in each of many postures with the hand at the
-goal, or at a start: inverse kinematics from random seeds, free of the arm itself and the table.
+nearer than the margin to a link that no joint carries away, to the goal or a start, or to the arm in each of many
+postures with the hand there (inverse kinematics from random seeds, free of the arm itself and the table). Where the
+arm does not clear the others from all starts, a planner that knows no demonstrations tells whether there is a way.
 
 The npz file holds for each arm NAME and its N balls the fields of `Passage`, ``NAME_task`` (N,), ``NAME_ball`` (N, 4) …
 """
@@ -39,18 +40,16 @@ from dt_viz.evaluate.options import (
     whole_number,
     write_npz,
 )
+from dt_viz.evaluate.passable import has_way, postures_at
 from dt_viz.evaluate.reactive import SETTINGS, driven
 from dt_viz.flows.fields import Array
 from dt_viz.folders import default_cache_folder
 from dt_viz.motion.following import MAX_TRACKING_ERROR
 from dt_viz.motion.stack import LIVE
 from dt_viz.obstacles.shapes import Sphere, as_point
-from dt_viz.robot.choices import Ranges
-from dt_viz.robot.collision import CollisionModel
 from dt_viz.robot.cover import protrusion
-from dt_viz.robot.inverse_kinematics import UnreachableError, track
+from dt_viz.robot.inverse_kinematics import UnreachableError
 from dt_viz.robot.models import ARMS
-from dt_viz.robot.robot import Robot
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import with_avoidance
 from dt_viz.scenario.tasks import TASKS
@@ -59,8 +58,6 @@ from dt_viz.session.frame import Stage
 
 SPREAD = 0.05
 """Largest distance of a ball's middle from the point that it is put at, metres, for an arm as large as the JACO."""
-NUM_POSTURES = 400
-"""Number of random postures of which one has to keep clear of a ball where a motion starts or ends."""
 NUM_FRAMES = 40
 """Number of frames of each of two drags that are timed."""
 
@@ -85,6 +82,8 @@ class Passage:
     """Distance of the robot in the loop from the goal at its end."""
     loop: float = np.nan
     """Its smallest clearance."""
+    has_way: bool | None = None
+    """Whether a planner finds a way, where the arm does not clear the ball."""
 
     @property
     def is_cleared(self) -> bool:
@@ -93,7 +92,8 @@ class Passage:
 
     def __str__(self) -> str:
         motions = f"{self.num_moving} of {self.num_starts} motions keep {1e3 * self.clearance:.1f} mm"
-        return f"{self.task}: {motions}; loop {1e3 * self.loop:.1f} mm, goal missed by {1e3 * self.missed:.2f} mm"
+        way = "" if self.has_way is None else f"; a planner finds {'a' if self.has_way else 'no'} way"
+        return f"{self.task}: {motions}; loop {1e3 * self.loop:.1f} mm, missed by {1e3 * self.missed:.2f} mm{way}"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -124,7 +124,8 @@ def run(options: argparse.Namespace) -> int:
         mean, _ = protrusion(robot.body.spheres, robot.meshes)
         rows.append(row | _row(passages) | {"frame × JACO": float(own / jacos), "cover mm": 1e3 * mean})
         for field in fields(Passage):
-            arrays[f"{arm}_{field.name}"] = np.array([getattr(passage, field.name) for passage in passages])
+            values = [getattr(passage, field.name) for passage in passages]
+            arrays[f"{arm}_{field.name}"] = np.array([-1 if value is None else value for value in values])
         write_npz(out, **arrays)
     report(rows, markdown=True)
     return 0
@@ -164,12 +165,12 @@ def _passages(engine: Engine, options: argparse.Namespace) -> Iterator[Passage]:
     """Measure so many balls."""
     rng, robot = np.random.default_rng(options.seed), engine.follower.robot
     for _ in range(options.count):
-        name, again = str(rng.choice(options.task)), -1
-        task, nominal, can_be_passed = engine.task(name), engine.nominal(Scenario(name)), False
+        name, again, postures = str(rng.choice(options.task)), -1, None
+        task, nominal = engine.task(name), engine.nominal(Scenario(name))
         q = engine.follower.undisturbed(nominal).tracked.q.reshape(-1, robot.num_joints)
-        while not can_be_passed:
+        while postures is None:
             avoidance, again = ArmAvoidance(_ball(engine, q, rng, options.size)), again + 1
-            can_be_passed = _can_be_passed(robot, nominal.learned.demonstrated.ends, avoidance, rng)
+            postures = postures_at(robot, nominal.learned.demonstrated.ends, avoidance, rng)
         (ball,), place = avoidance.obstacles, measured(engine, task, avoidance)
         values = (*ball.position, ball.radius), again, len(place.ends) - 1, len(place.rollouts)
         passage = Passage(name, *values, avoidance.margin - place.clearance, place.clearance)
@@ -177,6 +178,8 @@ def _passages(engine: Engine, options: argparse.Namespace) -> Iterator[Passage]:
             joints, goal = _in_the_loop(engine, avoiding(task, avoidance), int(rng.choice([*place.motions])))
             missed = float(np.linalg.norm(robot.end_effector(joints[-1]) - goal))
             passage = replace(passage, missed=missed, loop=robot.collision.nearest_to_obstacle(joints, ball).distance)
+        if not passage.is_cleared:
+            passage = replace(passage, has_way=has_way(robot, ball, avoidance.margin, postures))
         yield passage
 
 
@@ -191,28 +194,6 @@ def _ball(engine: Engine, q: Array, rng: np.random.Generator, size: tuple[float,
         ball = Sphere(as_point(middle), robot.size * rng.uniform(*size))
         if robot.collision.obstacle_distance(posture[None], ball)[0][0] < ArmAvoidance(ball).margin:
             return ball
-
-
-def _can_be_passed(robot: Robot, places: Array, avoidance: ArmAvoidance, rng: np.random.Generator) -> bool:
-    """Whether the arm may move between places (R, 3) of the hand, metres, around a ball: see the file's first lines."""
-
-    def keeps_clear(solids: CollisionModel, q: Array) -> bool:
-        return solids.nearest_to_obstacle(q[None], avoidance.avoided).distance >= avoidance.margin
-
-    def is_sound(q: Array) -> bool:
-        near = robot.collision.nearest_to_itself(q[None])
-        return (near is None or near.distance > 0) and robot.collision.nearest_to_table(q[None]).distance >= 0
-
-    fixed = [mesh for mesh in robot.meshes if mesh.joint < robot.num_fixed]
-    if not keeps_clear(CollisionModel(robot, fixed, robot.num_fixed), robot.home):
-        return False
-    for place in places:
-        seeds = Ranges.of(robot.lower, robot.upper).random(rng, NUM_POSTURES)
-        found = track(robot, np.broadcast_to(place, (len(seeds), 1, 3)), seeds)
-        q = found.q[found.error[:, 0] < MAX_TRACKING_ERROR, 0]
-        if not any(keeps_clear(robot.collision, one) and is_sound(one) for one in q):
-            return False
-    return True
 
 
 def _in_the_loop(engine: Engine, scenario: Scenario, rollout: int) -> tuple[Array, Array]:
@@ -254,6 +235,7 @@ def _row(passages: Sequence[Passage]) -> Row:
         "least mm": 1e3 * float(np.nanmin([passage.clearance for passage in passages])),
         "some starts": sum(0 < passage.num_moving < passage.num_starts for passage in passages),
         "no way": sum(passage.num_moving == 0 for passage in passages),
+        "of these a way": sum(passage.has_way or False for passage in passages),
         "drawn again": sum(passage.drawn_again for passage in passages),
         "loop at goal": f"{sum(passage.missed <= SETTINGS.at_goal for passage in passages)} of {num}",
         "loop least mm": 1e3 * float(np.nanmin([passage.loop for passage in passages])),

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import changed
+from scenes import avoiding, changed
 
 from dt_viz.control.arm_system import ArmSystem
 from dt_viz.control.controller import ArmController, Phase
@@ -146,6 +146,19 @@ class TestArrival:
         assert scene.missed(robot.q) < 1e-3
         near = load_jaco().collision.nearest_to_obstacle(np.array(robot.passed)[::5], solved.scenario.obstacle)
         assert near.distance > 0.8 * MARGIN
+
+    def test_it_rests_only_once_the_way_around_a_sphere_has_come_to_that_of_the_end(self, engine):
+        ball = Sphere((0.042637, -0.469151, 0.353698), 0.112008)
+        solved = engine.solved(avoiding("drop_pots", ball, space="cspace", margin=0.01), LIVE)
+        assert solved.arm is not None
+        for rollout in (5, 6):  # the way around it still moves the goal where the course of the last one ends
+            robot = Robot(ArmController(engine.follower, solved), solved.arm.p[np.argmax(solved.arm.index == rollout)])
+            robot.controller.begin(robot.q, rollout)
+            while not robot.phases or robot.phases[-1] is not Phase.RESTING:
+                robot.run(0.01)
+                assert len(robot.phases) < 2000
+            missed = engine.follower.robot.end_effector(robot.q) - solved.nominal.goal
+            assert np.linalg.norm(missed) < 1e-3
 
     def test_and_then_home_and_back(self, scene):
         robot = Robot(scene.controller(), scene.start).run(12, until=Phase.RESTING)

@@ -18,18 +18,25 @@ from arm_files import link, random_postures, urdf, write
 from scipy.spatial import KDTree
 
 import dt_viz as dt
+from dt_viz.control.controller import ArmController
 from dt_viz.folders import default_cache_folder
+from dt_viz.learning.store import FitStore
+from dt_viz.motion.stack import LIVE
 from dt_viz.robot import models
 from dt_viz.robot.arm_cache import from_arrays, to_arrays
-from dt_viz.robot.choices import semantic_homes
+from dt_viz.robot.choices import ArmSearchSettings, Ranges, find_touching, semantic_homes
+from dt_viz.robot.collision import CollisionModel
 from dt_viz.robot.cover import CoverSettings, cover, protrusion
-from dt_viz.robot.inverse_kinematics import UnreachableError
+from dt_viz.robot.inverse_kinematics import UnreachableError, track
 from dt_viz.robot.meshes import LinkMesh
 from dt_viz.robot.models import ARMS, load_arm, load_jaco, robot_from_urdf, urdf_path
 from dt_viz.robot.placement import PlacementSettings, follows, place
 from dt_viz.robot.robot import Robot
 from dt_viz.robot.urdf import ArmError, read_semantic
+from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import TASKS
+from dt_viz.session.engine import Engine
+from dt_viz.session.tasks_in_reach import in_reach
 
 QUICK = ("so100", "xarm7")
 each_arm = pytest.mark.parametrize(
@@ -132,6 +139,54 @@ def test_links_that_may_touch_are_few_and_the_others_are_apart_in_some_postures(
     assert all(pair <= names and len(pair) == 2 for pair in robot.touching) and len(robot.touching) < 8
     apart = [robot.collision.nearest_to_itself(q[None]) for q in random_postures(robot, 60)]
     assert sum(near is None or near.distance > 0.01 for near in apart) > 10
+
+
+@pytest.mark.parametrize(("gap", "told"), [(0.012, True), (0.0205, True), (0.0225, False)])
+def test_a_constant_gap_that_covers_take_for_contact_may_be_one(robot, gap, told):
+    """The origin of the second joint turns about the axis that a ball on the base is on."""
+    q = random_postures(robot, 1)
+    middle = robot.forward_kinematics(q[0])[1][1]
+    below = middle * [0, 0, 1] - [0, 0, 0.2]
+    shape = trimesh.creation.icosphere(subdivisions=4, radius=0.04)
+    distance = np.linalg.norm(middle - below) - 0.04
+    wide = shape.vertices * (distance - gap) / 0.04
+    balls = [LinkMesh("base", -1, wide + below, shape.faces), LinkMesh("arm", 1, shape.vertices, shape.faces)]
+    solids = CollisionModel(robot, balls, 0)
+    near = solids.nearest_to_itself(q)
+    assert near is not None and near.distance == pytest.approx(gap, abs=1e-3)
+    ranges = Ranges.of(robot.lower, robot.upper)
+    settings = ArmSearchSettings(num_postures=30)
+    assert bool(find_touching(solids, balls, ranges, None, 5.5e-3, settings)[0]) is told
+    assert bool(find_touching(solids, balls, ranges, None, 0.0, settings)[0]) is (gap < 0.02 * robot.reach)
+
+
+def test_courses_of_an_arm_whose_postures_are_not_unique_end_where_its_motions_do():
+    robot = load_arm("xarm7")
+    engine = Engine(in_reach(TASKS, robot), FitStore(default_cache_folder()), robot)
+    follower, solved = engine.follower, engine.solved(Scenario("drop_pots"), LIVE)
+    known, goal = follower.reference_postures(solved.nominal.learned), solved.nominal.goal
+    straight = [track(robot, goal[None], posture, reference=posture).q[0] for posture in known.references]
+    far = int(np.abs(straight - known.on_path[:, -1]).max(axis=1).argmax())
+    assert np.abs(straight[far] - known.on_path[far, -1]).max() > 0.5  # another posture that is a best one, too
+    posture = tuple(known.references[far].tolist())
+    solved = replace(solved, nominal=replace(solved.nominal, posture=posture))
+    *starts, end = follower.at_ends(solved.nominal)
+    controller = ArmController(follower, solved)
+    for rollout, start in enumerate(starts):
+        controller.begin(start, rollout)
+        np.testing.assert_allclose(controller.ahead[-1], end, atol=0.02)
+    controller.home(2)
+    np.testing.assert_allclose(controller.ahead[-1], starts[2], atol=0.02)
+
+
+def test_the_jaco_in_the_cache_is_the_one_that_was_made(robot, monkeypatch):
+    models._load("jaco", None)  # into this module's cache
+    monkeypatch.setattr(models._Given, "_robot", lambda *_: pytest.fail("it is made again"))
+    again = models._load("jaco", None)
+    made, kept = to_arrays(robot), to_arrays(again)
+    assert made.keys() == kept.keys()
+    for name, values in made.items():
+        np.testing.assert_array_equal(kept[name], values, strict=True)
 
 
 @each_arm
