@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dt_viz.robot.inverse_kinematics import UnreachableError, inverse_kinematics, track
+from dt_viz.robot.inverse_kinematics import UnreachableError, best_start, inverse_kinematics, track
 
 if TYPE_CHECKING:
     from dt_viz.flows.fields import Array
@@ -36,6 +36,8 @@ class PlacementSettings:
     """Moves upwards that are tried."""
     num_samples: int = 40
     """Number of samples of each path that are followed."""
+    turned: float = 0.1
+    """Angle of the hand from its orientations up to which these are followed, rad."""
     error: float = 1e-3
     """Distance of the hand from a path up to which it is followed, metres."""
     room: float = 0.01
@@ -60,6 +62,7 @@ def place(
     paths: Sequence[Array],
     scale: float | None = None,
     settings: PlacementSettings = PlacementSettings(),
+    orientations: Sequence[Array] | None = None,
 ) -> Placement:
     """Find where an arm follows the paths of a task that was made for the JACO, or for an arm of its size.
 
@@ -71,15 +74,20 @@ def place(
         paths: (T, 3) positions of the hand on each, metres, with the arm's front at −y.
         scale: the scale that is wanted; None takes the largest that fits, up to that of the arm's reach.
         settings: what is tried.
+        orientations: (T, 4) of the hand on each, wxyz, that are followed, too.
 
     Raises:
         UnreachableError: No place fits, at the scale that is wanted; it says which one would.
     """
-    sampled = np.array([_resampled(path, settings.num_samples) for path in paths])
+    sampled, wanted = (
+        None if given is None else np.array([_resampled(each, settings.num_samples) for each in given])
+        for given in (paths, orientations)
+    )
+    assert sampled is not None
     first = robot.size if scale is None else scale
     for part in settings.scales:
         for placement in _candidates(robot, sampled, part * first, settings):
-            if follows(robot, placement(sampled), settings):
+            if follows(robot, placement(sampled), settings, wanted):
                 if scale is not None and part < 1:
                     way_out = f"the largest scale that fits is about {placement.scale:.2g}"
                     raise UnreachableError(f"{robot.title} cannot follow the task at the scale {scale:.3g}: {way_out}")
@@ -88,17 +96,24 @@ def place(
     raise UnreachableError(f"{robot.title} cannot follow the task anywhere ahead of it, even at the scale {least:.2g}")
 
 
-def follows(robot: Robot, paths: Array, settings: PlacementSettings = PlacementSettings()) -> bool:
-    """Return whether an arm follows paths (R, T, 3), metres, from their starts."""
+def follows(
+    robot: Robot, paths: Array, settings: PlacementSettings = PlacementSettings(), orientations: Array | None = None
+) -> bool:
+    """Return whether an arm follows paths (R, T, 3), metres, from their starts, with orientations (R, T, 4) if any."""
     if paths[..., 2].min() < 0:
         return False
     try:
-        reference = inverse_kinematics(robot, paths[0, -1])
-        starts = np.array([inverse_kinematics(robot, path[0], seed=reference) for path in paths])
+        if orientations is None:
+            reference = inverse_kinematics(robot, paths[0, -1])
+            starts = np.array([inverse_kinematics(robot, path[0], seed=reference) for path in paths])
+        else:
+            reference = best_start(robot, paths[0], orientations[0])
+            starts = np.broadcast_to(reference, (len(paths), robot.num_joints))
     except UnreachableError:
         return False
-    tracked = track(robot, paths, starts, reference=reference)
-    if tracked.error.max() > settings.error or tracked.limits_hit.any() or tracked.damped.any():
+    tracked = track(robot, paths, starts, reference=reference, orientations=orientations)
+    missed = tracked.error.max() > settings.error or tracked.turned.max() > settings.turned
+    if missed or tracked.limits_hit.any() or tracked.damped.any():
         return False
     for q in tracked.q[:, ::4]:
         near = robot.collision.nearest_to_itself(q)

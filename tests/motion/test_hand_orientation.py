@@ -152,3 +152,12 @@ class TestLibrary:
         assert np.linalg.norm(arm.robot.end_effector(q) - motion.goal) < 2e-3
         turned = arm.robot.hand_orientation(q[None])
         assert np.rad2deg(apart(turned, motion.rollouts()[0].orientations[-1])).max() < 2
+
+    def test_a_task_is_placed_where_its_orientations_are_followed(self):
+        arm, aside = dt.load_arm("jaco"), Rotation.from_euler("x", 120, degrees=True)
+        takes = [replace(take, orientations=quaternions(aside * rotation(take.orientations))) for take in in_reach()]
+        off = []
+        for placed in (arm.place(takes), arm.place([replace(take, orientations=None) for take in takes])):
+            turned = [replace(one, orientations=take.orientations) for one, take in zip(placed, takes, strict=True)]
+            off.append(max(joints.turned.max() for joints in arm.rollouts(dt.fit(turned))))
+        assert off[0] < 6 < off[1]
