@@ -150,13 +150,12 @@ def best_start(robot: Robot, path: Array, orientations: Array) -> Array:
     Raises:
         UnreachableError: as `inverse_kinematics`, of the first place.
     """
-    starts = arriving(robot, path[0], orientation=orientations[0])
+    settings, starts = robot.sized_tracking, arriving(robot, path[0], orientation=orientations[0])
     paths, wanted = (np.broadcast_to(each, (len(starts), *each.shape)) for each in (path, orientations))
     tracked = track(robot, paths, starts, orientations=wanted)
-    missed = (
-        np.maximum(tracked.error.max(axis=1) - robot.sized_tracking.tolerance, 0) / robot.sized_tracking.turn_length
-    )
-    return starts[np.argmin(missed + tracked.turned.max(axis=1))]
+    missed = np.maximum(tracked.error.max(axis=1) - settings.tolerance, 0) / settings.turn_length
+    off = missed + tracked.turned.max(axis=1)
+    return starts[np.argmax(off <= off.min() + settings.as_well_turned)]  # the first of those is the best posture
 
 
 def track(
