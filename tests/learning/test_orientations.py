@@ -201,6 +201,21 @@ class TestPreparation:
         first = 200 - len(motions.turns[0])
         np.testing.assert_allclose(motions.turns[0], (2 * np.pi - u)[first:, None] * [0.2, 0, 0], atol=1e-6)
 
+    def test_jitter_of_the_hand_is_smoothed_and_said(self):
+        rng, clean = np.random.default_rng(4), dt.fit(TAKES).rollouts()
+        noise = [Rotation.from_rotvec(np.deg2rad(1.5) * rng.normal(size=(150, 3))) for _ in TAKES]
+        trembling = [
+            Demonstration(take.times, take.positions, take.name, quaternions(rotation(hand(take)) * each))
+            for take, each in zip(TAKES, noise, strict=True)
+        ]
+        with pytest.warns(dt.DemonstrationWarning, match="turns with a jitter of 2.*smoothed"):
+            motion = dt.fit(trembling)
+        off = [
+            apart(hand(one), hand(other)[: len(hand(one))]) for one, other in zip(clean, motion.rollouts(), strict=True)
+        ]
+        assert np.rad2deg(np.median(off)) < 1
+        assert prepare(TAKES).warnings == ()
+
     def test_more_than_half_a_turn_is_said(self):
         with pytest.warns(dt.DemonstrationWarning, match="turns by"):
             far = dt.fit(turning_takes(turn=4.0))
