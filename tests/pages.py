@@ -80,6 +80,7 @@ class FrameWithoutMotion(Frame):
     shaping: Any = ()
     chosen: Any = 0
     remembers: Any = False
+    has_orientation: Any = False
     reason: Any = ""
     labels: Any = ()
     learned_steps: Any = ()

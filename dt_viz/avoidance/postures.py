@@ -17,13 +17,15 @@ from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.body_points import BodyPoints
 from dt_viz.robot.collision import SELF_MARGIN
-from dt_viz.robot.inverse_kinematics import loses_branch, track
+from dt_viz.robot.inverse_kinematics import loses_branch, targets_of, track
 from dt_viz.robot.robot import Robot
 
 NUM_TRIED = 384
 """Number of random postures that they are chosen from."""
 SPREAD = (0.2, 2.0)
 """Smallest and largest standard deviation of their joints from the usual posture, rad."""
+TURNED = 0.05
+"""Angle by which the hand may be turned farther beside its orientation than with the usual posture, rad."""
 REACHED = 1e-4
 """Largest distance of the hand from a place that counts as reached, metres."""
 
@@ -109,7 +111,9 @@ def reference_postures(
     moving = robot.links.with_end_effector(robot)
     heights = (moving.positions(robot, tracked.q)[..., 2] - moving.radius).min(axis=(1, 2))
     follows = (tracked.error < REACHED) & ~tracked.limits_hit & ~tracked.damped
-    sound = follows.all(axis=1) & ~loses_branch(robot, tracked.q, paths) & (heights >= min(0.0, heights[0]))
+    follows &= tracked.turned <= tracked.turned[0].max() + TURNED
+    lost = loses_branch(robot, tracked.q, targets_of(robot, paths, wanted))
+    sound = follows.all(axis=1) & ~lost & (heights >= min(0.0, heights[0]))
     sound[sound] = [robot.self_clearance(q, SELF_MARGIN) >= SELF_MARGIN for q in tracked.q[sound]]
     sound[0] = True
     away = np.sqrt((((tracked.q - tracked.q[0]) * robot.levers) ** 2).sum(axis=2).mean(axis=1))

@@ -65,6 +65,8 @@ class PreparationSettings:
     """Least length of these jumps, relative to the take's size, twice the median distance from its middle."""
     jitter: float = 1.05
     """Least factor by which jitter makes a take longer. Clean takes get shorter by 1.1 % when they are smoothed."""
+    turn_jitter: float = 0.01
+    """RMS jitter of the hand's orientation up to which it is as good as none, rad."""
     cutoff: float = 5.0
     """Frequency above which motion is jitter, Hz; tremor begins at 6 Hz."""
     cycles: float = 20.0
@@ -267,6 +269,20 @@ def _without_jitter(take: Repaired, grid: _Grid, settings: PreparationSettings) 
             break
         smooth, cutoff, noise = smoother, cutoff / 1.5, max(noise, more)
     return smooth if settings.smooth_jitter else None
+
+
+def smoothed_turns(take: Repaired, vectors: Array, settings: PreparationSettings) -> Array:
+    """Rotation vectors (T, 3), rad, of the hand along a take, smoothed as positions are where they jitter."""
+    if len(take.times) < 8:
+        return vectors
+    turning = Repaired(take.demonstration, take.times, vectors)
+    grid = _Grid(turning, np.zeros(0, int))
+    smooth = _without_jitter(turning, grid, settings)
+    if turning.jitter <= settings.turn_jitter:
+        return vectors
+    remedy = "" if smooth is None else "smoothed"
+    take.find("jitter", f"turns with a jitter of {np.rad2deg(turning.jitter):.1f}°", remedy)
+    return vectors if smooth is None else interpolate(take.times, grid.nodes, smooth)
 
 
 class _Grid:

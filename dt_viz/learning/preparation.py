@@ -13,7 +13,7 @@ from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.rotations import logarithm, mean_orientation
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.demonstrations import Demonstration, samples_of
-from dt_viz.learning.inspection import Inspection, PreparationSettings, Repaired, repair
+from dt_viz.learning.inspection import Inspection, PreparationSettings, Repaired, repair, smoothed_turns
 from dt_viz.metrics import arc_length, discrete_frechet, resample_by_arc_length
 from dt_viz.warning import in_metres, in_millimetres
 
@@ -167,18 +167,19 @@ def prepare(demonstrations: Sequence[Demonstration], settings: PreparationSettin
         raise ImitationError("every demonstration starts at the goal and stays there; there is nothing to learn")
     names = tuple(take.demonstration.name for take in kept.values())
     times, positions = zip(*((take.times, take.positions) for take in kept.values()), strict=True)
-    orientation, turns = _turns([take for take in takes if take.kept])
+    orientation, turns = _turns([take for take in takes if take.kept], settings)
     inspections = tuple(take.inspection for take in takes)
     return Motions(tuple(kept), names, times, positions, goal, spread, inspections, repaired, orientation, turns)
 
 
-def _turns(takes: Sequence[Repaired]) -> tuple[Array | None, tuple[Array, ...]]:
+def _turns(takes: Sequence[Repaired], settings: PreparationSettings) -> tuple[Array | None, tuple[Array, ...]]:
     """Find the goal's orientation (4,), and rotation vectors (T_i, 3) of the takes; none unless all have some."""
     if len(takes[0].positions[0]) < 3 or any(take.demonstration.orientations is None for take in takes):
         return None, ()
     orientations = [take.orientations_at(take.times) for take in takes]
     goal = mean_orientation(np.stack([turned[-1] for turned in orientations]))
-    turns = tuple(logarithm(goal, turned) for turned in orientations)
+    pairs = zip(takes, orientations, strict=True)
+    turns = tuple(smoothed_turns(take, logarithm(goal, turned), settings) for take, turned in pairs)
     for take, turn in zip(takes, turns, strict=True):
         if (farthest := np.linalg.norm(turn, axis=1).max()) > np.pi:
             take.find("turn", f"turns by {np.rad2deg(farthest):.0f}° away from the orientation at the goal")

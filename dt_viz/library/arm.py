@@ -21,7 +21,7 @@ from dt_viz.library.motion import Path as HandPath
 from dt_viz.motion.following import Follower
 from dt_viz.motion.solve import Solved, solve
 from dt_viz.motion.stack import FINE, LIVE, build_stack
-from dt_viz.robot.inverse_kinematics import best_start, inverse_kinematics, track
+from dt_viz.robot.inverse_kinematics import UnreachableError, best_start, inverse_kinematics, track
 from dt_viz.robot.models import EndEffector, robot_from_urdf
 from dt_viz.robot.models import load_arm as load_robot
 from dt_viz.robot.placement import place
@@ -130,7 +130,8 @@ class Arm:
         """Move, scale and turn demonstrations in space, made for an arm of the JACO's size, into reach.
 
         Args:
-            demonstrations: with three coordinates, the arm's front at −y as in `dt_viz.example`.
+            demonstrations: with three coordinates, the arm's front at −y as in `dt_viz.example`. Where the arm cannot
+                follow the hand's orientations at any place, positions alone decide.
             scale: the scale that is wanted; None takes the largest that fits, up to the arm's reach by the JACO's.
 
         Raises:
@@ -139,7 +140,15 @@ class Arm:
         """
         if demonstrations and demonstrations[0].dimension != NUM_COORDINATES:
             raise ValueError(f"the arm follows motions in space, with 3 coordinates, not {demonstrations[0].dimension}")
-        placed = place(self._on_page, [demonstration.positions for demonstration in demonstrations], scale)
+        paths, turns = [one.positions for one in demonstrations], [one.orientations for one in demonstrations]
+        given = [wxyz for wxyz in turns if wxyz is not None]
+        wanted = given if given and len(given) == len(turns) else None
+        try:
+            placed = place(self._on_page, paths, scale, orientations=wanted)
+        except UnreachableError:
+            if wanted is None:
+                raise
+            placed = place(self._on_page, paths, scale)
         turn = self.robot.base @ self._on_page.base.T
 
         def in_reach(one: Demonstration) -> Demonstration:

@@ -108,7 +108,7 @@ def arriving(
         direction, weight = np.asarray(hand_direction, dtype=float), settings.asked_direction_weight
     if orientation is not None:
         weight = settings.first_orientation_weight
-    wanted = _targets(robot, target, orientation)
+    wanted = targets_of(robot, target, orientation)
     direction = direction / np.linalg.norm(direction)
 
     scatter = np.random.default_rng(0).normal(scale=0.8, size=(settings.num_restarts, robot.num_joints))
@@ -152,13 +152,12 @@ def best_start(robot: Robot, path: Array, orientations: Array) -> Array:
     Raises:
         UnreachableError: as `inverse_kinematics`, of the first place.
     """
-    starts = arriving(robot, path[0], orientation=orientations[0])
+    settings, starts = robot.sized_tracking, arriving(robot, path[0], orientation=orientations[0])
     paths, wanted = (np.broadcast_to(each, (len(starts), *each.shape)) for each in (path, orientations))
     tracked = track(robot, paths, starts, orientations=wanted)
-    missed = (
-        np.maximum(tracked.error.max(axis=1) - robot.sized_tracking.tolerance, 0) / robot.sized_tracking.turn_length
-    )
-    return starts[np.argmin(missed + tracked.turned.max(axis=1))]
+    missed = np.maximum(tracked.error.max(axis=1) - settings.tolerance, 0) / settings.turn_length
+    off = missed + tracked.turned.max(axis=1)
+    return starts[np.argmax(off <= off.min() + settings.as_well_turned)]  # the first of those is the best posture
 
 
 def track(
@@ -210,7 +209,7 @@ def track(
     if path.shape[-1] != 3 or start.shape != (*path.shape[:-2], robot.num_joints):
         raise ValueError(f"path must be (*B, T, 3) and start (*B, n), got {path.shape} and {start.shape}")
     shape = (*path.shape[:-1], robot.num_joints)
-    targets, starts = _targets(robot, path, orientations), robot.clip(start.reshape(-1, robot.num_joints))
+    targets, starts = targets_of(robot, path, orientations), robot.clip(start.reshape(-1, robot.num_joints))
     paths = targets.reshape(-1, *targets.shape[-2:])
     references = starts if reference is None else _references(robot, reference, start.shape)
     settings, turns = robot.sized_tracking, orientations is not None
@@ -250,7 +249,7 @@ def drawn_onto(robot: Robot, q: Array, positions: Array, reference: Array, orien
     """
     settings, turns = robot.sized_tracking, orientations is not None
     posture = _near(robot, reference[None], settings.first_orientation_weight if turns else None)
-    begin, targets = np.array(q, order="C"), np.array(_targets(robot, positions, orientations), order="C")
+    begin, targets = np.array(q, order="C"), np.array(targets_of(robot, positions, orientations), order="C")
     which = np.zeros(len(q), int)
     if turns:
         return _turned_to(robot, begin, targets, which, posture, settings.final_sweeps)
@@ -270,7 +269,7 @@ def _turned_to(
     return settle(arm, posture, q, targets, which, 0, sweeps, -1.0)
 
 
-def _targets(robot: Robot, positions: Array, orientations: ArrayLike | None) -> Array:
+def targets_of(robot: Robot, positions: Array, orientations: ArrayLike | None) -> Array:
     """Places (*B, 3) of the end effector; or with orientations (*B, 4) of it those of the last joint, too, (*B, 12)."""
     if orientations is None:
         return positions
@@ -305,7 +304,7 @@ def _walk(robot: Robot, paths: Array, starts: Array, posture: Postures, stride: 
     """Walk along targets (B, T, 3 or 12), all at once, one stride after the other; return rough joints (B, T, n)."""
     begin = robot.end_effector(starts)
     if paths.shape[-1] > 3:
-        begin = _targets(robot, begin, robot.hand_orientation(starts))
+        begin = targets_of(robot, begin, robot.hand_orientation(starts))
     lines = np.concatenate([begin[:, None], paths], axis=1)
     lengths = np.cumsum(np.linalg.norm(np.diff(_along(robot, lines), axis=1), axis=-1), axis=1)
     num_strides = 1 + int(lengths.max() / stride)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dt_viz.robot.inverse_kinematics import UnreachableError, inverse_kinematics, track
+from dt_viz.robot.inverse_kinematics import UnreachableError, best_start, inverse_kinematics, track
 
 if TYPE_CHECKING:
     from dt_viz.flows.fields import Array
@@ -36,6 +36,8 @@ class PlacementSettings:
     """Moves upwards that are tried."""
     num_samples: int = 40
     """Number of samples of each path that are followed."""
+    turned: float = 0.1
+    """Angle of the hand from its orientations up to which these are followed, rad."""
     error: float = 1e-3
     """Distance of the hand from a path up to which it is followed, metres."""
     room: float = 0.01
@@ -62,6 +64,7 @@ def place(
     settings: PlacementSettings = PlacementSettings(),
     *,
     on_table: bool = False,
+    orientations: Sequence[Array] | None = None,
 ) -> Placement:
     """Find where an arm follows the paths of a task that was made for the JACO, or for an arm of its size.
 
@@ -74,12 +77,17 @@ def place(
         scale: the scale that is wanted; None takes the largest that fits, up to that of the arm's reach.
         settings: what is tried.
         on_table: whether heights above the table are scaled only.
+        orientations: (T, 4) of the hand on each, wxyz, that are followed, too.
 
     Raises:
         UnreachableError: No place fits, at the scale that is wanted; it says which one would.
     """
     sampled = np.array([resampled(path, settings.num_samples) for path in paths])
-    placement = fitting(robot, sampled, robot.size if scale is None else scale, settings, on_table=on_table)
+    wanted = (
+        None if orientations is None else np.array([resampled(each, settings.num_samples) for each in orientations])
+    )
+    first = robot.size if scale is None else scale
+    placement = fitting(robot, sampled, first, settings, on_table=on_table, orientations=wanted)
     if scale is not None and placement.scale < scale:
         way_out = f"the largest scale that fits is about {placement.scale:.2g}"
         raise UnreachableError(f"{robot.title} cannot follow the task at the scale {scale:.3g}: {way_out}")
@@ -93,6 +101,7 @@ def fitting(
     settings: PlacementSettings = PlacementSettings(),
     *,
     on_table: bool = False,
+    orientations: Array | None = None,
 ) -> Placement:
     """Find where an arm follows paths (R, T, 3), metres, at the largest scale up to a given one; see `place`.
 
@@ -101,23 +110,30 @@ def fitting(
     """
     for part in settings.scales:
         for placement in _candidates(robot, paths, part * scale, settings, on_table):
-            if follows(robot, placement(paths), settings):
+            if follows(robot, placement(paths), settings, orientations):
                 return placement
     least = settings.scales[-1] * scale
     raise UnreachableError(f"{robot.title} cannot follow the task anywhere ahead of it, even at the scale {least:.2g}")
 
 
-def follows(robot: Robot, paths: Array, settings: PlacementSettings = PlacementSettings()) -> bool:
-    """Return whether an arm follows paths (R, T, 3), metres, from their starts."""
+def follows(
+    robot: Robot, paths: Array, settings: PlacementSettings = PlacementSettings(), orientations: Array | None = None
+) -> bool:
+    """Return whether an arm follows paths (R, T, 3), metres, from their starts, with orientations (R, T, 4) if any."""
     if paths[..., 2].min() < 0:
         return False
     try:
-        reference = inverse_kinematics(robot, paths[0, -1])
-        starts = np.array([inverse_kinematics(robot, path[0], seed=reference) for path in paths])
+        if orientations is None:
+            reference = inverse_kinematics(robot, paths[0, -1])
+            starts = np.array([inverse_kinematics(robot, path[0], seed=reference) for path in paths])
+        else:
+            reference = best_start(robot, paths[0], orientations[0])
+            starts = np.broadcast_to(reference, (len(paths), robot.num_joints))
     except UnreachableError:
         return False
-    tracked = track(robot, paths, starts, reference=reference)
-    if tracked.error.max() > settings.error or tracked.limits_hit.any() or tracked.damped.any():
+    tracked = track(robot, paths, starts, reference=reference, orientations=orientations)
+    missed = tracked.error.max() > settings.error or tracked.turned.max() > settings.turned
+    if missed or tracked.limits_hit.any() or tracked.damped.any():
         return False
     for q in tracked.q:
         if robot.self_clearance(q, settings.room) >= settings.room and _lowest(robot, q) > 0:

@@ -25,6 +25,9 @@ class TrackingSettings:
     first."""
     first_orientation_weight: float = 30.0
     """That weight until postures have settled: with the whole of it they find their branch of the wrist less often."""
+    as_well_turned: float = 0.05
+    """Angle by which the hand may be turned farther beside its orientations along a path from a start of a better
+    posture, rad."""
     turning_sweeps: int = 30
     """Largest number of sweeps that improve the posture where orientations are wanted."""
     turn_length: float = scales(0.2)

@@ -183,11 +183,11 @@ class Frame:
     def hand_frames(self, num: int) -> tuple[Array, Array] | None:
         """Places (num, 3), metres, evenly along the rollout that the arm follows, and orientations (num, 3, 3) there.
 
-        None where none were learned, or there is no such rollout.
+        None where none were learned, or the arm follows no rollout.
         """
-        rows = np.flatnonzero(self.drawn.index == self.chosen) if self.chosen is not None else np.zeros(0, int)
-        if not self.has_orientation or not len(rows):
+        if not self.has_orientation or self.chosen is None:
             return None
+        rows = np.flatnonzero(self.drawn.index == self.chosen)
         length = arc_length(self.drawn.positions[rows])
         kept = rows[np.searchsorted(length, np.linspace(0, length[-1], num)).clip(0, len(rows) - 1)]
         turned = self.motion.nominal.orientations_at(self.drawn.index[kept], self.drawn.fraction[kept])

@@ -3,16 +3,21 @@
 import json
 import re
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hook import NUM_DEMONSTRATIONS, apart, hook
 from PIL import Image
+from scipy.spatial.transform import Rotation
+from turning import turning_takes
 
 from dt_viz.evaluate import figures, imitation
 from dt_viz.evaluate.__main__ import main
 from dt_viz.evaluate.figures import FigurePanel
-from dt_viz.evaluate.held_out import WAYS, follow
+from dt_viz.evaluate.held_out import WAYS, degrees_off, follow
+from dt_viz.flows.rotations import quaternions, rotation
+from dt_viz.learning.augmented import fit_augmented
 from dt_viz.learning.demonstrations import Demonstration, save_demonstrations
 from dt_viz.learning.imitation import fit, grown_grid
 from dt_viz.metrics import resample_by_arc_length, rms_at_equal_times
@@ -207,3 +212,23 @@ def test_what_was_chosen_and_the_trivial_way_are_printed(lasa, tmp_path, capsys)
         r"hooks: (plain|augmented)\. \d demonstrations left out: plain .* mm .* × the shifted mean", printed
     )
     assert f"{row['of_mean']:.3f} at worst" in printed
+
+
+def test_the_hands_orientation_is_measured_beside_the_mean_of_the_others(tmp_path, capsys):
+    takes = turning_takes(4)
+    save_demonstrations(tmp_path / "turning.npz", takes)
+    run = ["imitation", str(tmp_path / "turning.npz"), "--state", "auto", "--leave-one-out", "--out", str(tmp_path)]
+    assert main(run) == 0
+    (row,) = json.loads((tmp_path / "figures.json").read_text())["turns"]
+    assert "degrees from the demonstration's" in capsys.readouterr().out
+    with np.load(tmp_path / "turning-held-out.npz") as arrays:
+        for title, way in (("held_out", "learned"), ("mean_of_others", "mean")):
+            off = np.stack([arrays[f"{way}_degrees_{i}"] for i in range(4)])
+            assert row[f"{title}_median"] == pytest.approx(np.median(off))
+            assert row[f"{title}_largest"] == pytest.approx(off.max())
+    assert row["in_sample_median"] < 1 < row["held_out_median"] < 1.5 * row["mean_of_others_median"]
+    own = fit_augmented(takes)
+    aside = Rotation.from_rotvec([0.0, 0.0, np.deg2rad(10)])
+    turned = [replace(take, orientations=quaternions(aside * rotation(take.orientations))) for take in takes]
+    off = degrees_off(own, takes, turned[0])
+    assert np.median(off["learned"]) == pytest.approx(10, abs=1)

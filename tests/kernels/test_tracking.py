@@ -40,7 +40,7 @@ def test_a_step_is_that_of_array_operations(num, gain):
 @pytest.mark.parametrize("num", [1, LANES + 3])
 def test_a_step_that_turns_the_hand_is_that_of_array_operations(num, gain):
     objectives, q, places = postures(num, seed=4)
-    turns = Rotation.random(num, random_state=5)
+    turns = Rotation.from_quat(np.random.default_rng(5).normal(size=(num, 4)))
     targets = np.hstack([places, turns.as_matrix().transpose(0, 2, 1).reshape(num, 9)])
     expected = plain_tracking.newton(ROBOT, q, places, objectives, gain, turns)
     stepped = settle(ARM, objectives, q, targets, np.arange(num), gain, 1 - gain, -1.0)

@@ -17,6 +17,12 @@ RNG = np.random.default_rng(5)
 TAKES = turning_takes()
 
 
+def hand(motion):
+    """Orientations (T, 4) of a take or a path that has some."""
+    assert motion.orientations is not None
+    return motion.orientations
+
+
 @pytest.fixture(scope="module")
 def imitation():
     return fit_augmented(TAKES)
@@ -32,7 +38,7 @@ def states(imitation, num=20, seed=0):
 
 class TestRotations:
     def test_logarithm_and_exponential_undo_each_other_and_signs_change_nothing(self):
-        turned = TAKES[0].orientations
+        turned = hand(TAKES[0])
         vectors = logarithm(GOAL, turned)
         assert apart(exponential(GOAL, vectors), turned).max() < 1e-7
         signs = RNG.choice([-1.0, 1.0], size=(150, 1))
@@ -47,7 +53,7 @@ class TestRotations:
         np.testing.assert_allclose(nearest(GOAL, exponential(GOAL, vectors[0]), vectors[1]), vectors[0], atol=1e-7)
 
     def test_a_turn_of_the_world_leaves_vectors_as_they_are(self):
-        world, turned = Rotation.random(random_state=1), TAKES[0].orientations
+        world, turned = Rotation.from_rotvec([1.0, -2.0, 0.5]), hand(TAKES[0])
         both = [quaternions(world * rotation(q)) for q in (GOAL, turned)]
         np.testing.assert_allclose(logarithm(*both), logarithm(GOAL, turned), atol=1e-7)
 
@@ -103,54 +109,53 @@ class TestMotion:
         assert motion.state == "augmented" and "orientation" in motion.reason and "with orientation" in repr(motion)
         for take, path in zip(TAKES, motion.rollouts(), strict=True):
             near = np.linalg.norm(take.positions - path.positions[:, None], axis=-1).argmin(axis=1)
-            off = np.rad2deg(apart(path.orientations, take.orientations[near]))
+            off = np.rad2deg(apart(hand(path), hand(take)[near]))
             assert np.median(off) < 1.5 and off.max() < 5
-            assert apart(path.orientations[-1:], motion.rollouts()[0].orientations[-1]).max() < 1e-7
+            assert apart(hand(path)[-1:], hand(motion.rollouts()[0])[-1]).max() < 1e-7
 
     def test_signs_of_quaternions_change_nothing(self):
         flipped = [
-            Demonstration(t.times, t.positions, t.name, RNG.choice([-1.0, 1.0], (150, 1)) * t.orientations)
-            for t in TAKES
+            Demonstration(t.times, t.positions, t.name, RNG.choice([-1.0, 1.0], (150, 1)) * hand(t)) for t in TAKES
         ]
         for one, other in zip(dt.fit(TAKES).rollouts(), dt.fit(flipped).rollouts(), strict=True):
-            assert apart(one.orientations, other.orientations).max() < 1e-6
+            assert apart(hand(one), hand(other)).max() < 1e-6
             np.testing.assert_allclose(one.positions, other.positions, atol=1e-9)
 
     def test_a_turn_of_the_world_turns_the_motion(self):
         world = Rotation.from_rotvec([0.4, -0.7, 1.1])
         there = [
-            Demonstration(t.times, world.apply(t.positions), t.name, quaternions(world * rotation(t.orientations)))
+            Demonstration(t.times, world.apply(t.positions), t.name, quaternions(world * rotation(hand(t))))
             for t in TAKES
         ]
         start = np.array([[0.42, 0.13, 0.22]])
         (one,), (other,) = dt.fit(TAKES).rollouts(start), dt.fit(there).rollouts(world.apply(start))
         np.testing.assert_allclose(world.apply(one.positions), other.positions, atol=1e-6)
-        assert apart(quaternions(world * rotation(one.orientations)), other.orientations).max() < 1e-5
+        assert apart(quaternions(world * rotation(hand(one))), hand(other)).max() < 1e-5
 
     def test_a_turned_hand_comes_back_and_its_places_stay(self):
         motion = dt.fit(TAKES)
-        usual, turned = motion.rollouts()[0], motion.rollouts(orientations=TAKES[2].orientations[40])[0]
+        usual, turned = motion.rollouts()[0], motion.rollouts(orientations=hand(TAKES[2])[40])[0]
         np.testing.assert_array_equal(usual.positions, turned.positions)
-        off = apart(usual.orientations, turned.orientations)
+        off = apart(hand(usual), hand(turned))
         assert off[0] > 0.2 and off[-1] < 1e-6 and (np.diff(off) < 1e-9).all()
 
     def test_a_hand_in_the_loop_is_turned_to_the_goal(self):
         motion = dt.fit(TAKES)
-        place, hand, h = TAKES[0].positions[0], rotation(TAKES[0].orientations[60]), 0.02
+        place, now, h = TAKES[0].positions[0], rotation(hand(TAKES[0])[60]), 0.02
         controller = dt.HandController(motion, place)
         for k in range(500):
-            turn = controller.turn(quaternions(hand), h)
+            turn = controller.turn(quaternions(now), h)
             place = place + h * controller.step(place, h)
-            hand = Rotation.from_rotvec(h * turn) * hand
+            now = Rotation.from_rotvec(h * turn) * now
             if k == 60:
-                hand = Rotation.from_rotvec([0.5, 0.0, 0.0]) * hand  # somebody turns it
-        assert apart(quaternions(hand)[None], motion.rollouts()[0].orientations[-1]).max() < 1e-3
+                now = Rotation.from_rotvec([0.5, 0.0, 0.0]) * now  # somebody turns it
+        assert apart(quaternions(now)[None], hand(motion.rollouts()[0])[-1]).max() < 1e-3
 
     def test_saving_keeps_it(self, tmp_path):
         motion = dt.fit(TAKES)
         motion.save(tmp_path / "turns.npz")
         for one, other in zip(motion.rollouts(), dt.Motion.load(tmp_path / "turns.npz").rollouts(), strict=True):
-            np.testing.assert_array_equal(one.orientations, other.orientations)
+            np.testing.assert_array_equal(hand(one), hand(other))
 
     def test_what_does_not_learn_it_says_so(self):
         plain = dt.fit(TAKES, state="plain")
@@ -196,9 +201,24 @@ class TestPreparation:
         first = 200 - len(motions.turns[0])
         np.testing.assert_allclose(motions.turns[0], (2 * np.pi - u)[first:, None] * [0.2, 0, 0], atol=1e-6)
 
+    def test_jitter_of_the_hand_is_smoothed_and_said(self):
+        rng, clean = np.random.default_rng(4), dt.fit(TAKES).rollouts()
+        noise = [Rotation.from_rotvec(np.deg2rad(1.5) * rng.normal(size=(150, 3))) for _ in TAKES]
+        trembling = [
+            Demonstration(take.times, take.positions, take.name, quaternions(rotation(hand(take)) * each))
+            for take, each in zip(TAKES, noise, strict=True)
+        ]
+        with pytest.warns(dt.DemonstrationWarning, match="turns with a jitter of 2.*smoothed"):
+            motion = dt.fit(trembling)
+        off = [
+            apart(hand(one), hand(other)[: len(hand(one))]) for one, other in zip(clean, motion.rollouts(), strict=True)
+        ]
+        assert np.rad2deg(np.median(off)) < 1
+        assert prepare(TAKES).warnings == ()
+
     def test_more_than_half_a_turn_is_said(self):
         with pytest.warns(dt.DemonstrationWarning, match="turns by"):
             far = dt.fit(turning_takes(turn=4.0))
         assert "away from the orientation at the goal" in far.report()
-        off = apart(far.rollouts()[0].orientations[:1], turning_takes(turn=4.0)[0].orientations[:1])
+        off = apart(hand(far.rollouts()[0])[:1], hand(turning_takes(turn=4.0)[0])[:1])
         assert np.rad2deg(off).max() < 3

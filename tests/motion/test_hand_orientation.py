@@ -3,7 +3,7 @@
 # pyright: reportAttributeAccessIssue=false
 # (pinocchio has no stubs)
 
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import numpy as np
 import pinocchio as pin  # noqa: TID251, here it is the oracle
@@ -97,7 +97,7 @@ class TestCertificate:
         wanted = robot.hand_orientation(q)
         assert HandTurn.of(robot, q, wanted).largest < 1e-4
         aside = quaternions(rotation(wanted) * Rotation.from_euler("y", 10, degrees=True))
-        assert HandTurn.of(robot, q, -aside) == HandTurn(pytest.approx(10), pytest.approx(10))
+        assert astuple(HandTurn.of(robot, q, -aside)) == pytest.approx((10, 10))
         some = np.where(np.arange(len(q))[:, None] < 20, aside, wanted)
         found = HandTurn.of(robot, q, some)
         assert found.median < 1e-4 and found.largest == pytest.approx(10)
@@ -127,6 +127,7 @@ class TestLibrary:
     def test_a_joint_path_says_how_the_hand_is_turned(self, motion):
         arm = dt.load_arm("jaco")
         for path, joints in zip(motion.rollouts(), arm.rollouts(motion), strict=True):
+            assert path.orientations is not None and joints.turned is not None
             off = np.rad2deg(apart(arm.robot.hand_orientation(joints.q), path.orientations))
             np.testing.assert_allclose(joints.turned, off, atol=1e-6)
             assert joints.error.max() < 1e-3 and np.median(joints.turned) < 1
@@ -138,7 +139,7 @@ class TestLibrary:
         around = motion.stack(dt.Avoidance(ball, space="cspace"))
         for joints in arm.rollouts(around):
             clearance = arm.robot.body.clearance(arm.robot, joints.q, ball, 0.05)
-            assert clearance.min() > 0.005
+            assert clearance.min() > 0.005 and joints.turned is not None
             assert joints.turned[[0, -1]].max() < 3 and joints.turned.max() > joints.turned[0]
 
     def test_the_robot_in_the_loop_turns_its_hand(self, motion):
@@ -150,5 +151,16 @@ class TestLibrary:
             if controller.phase is Phase.RESTING:
                 break
         assert np.linalg.norm(arm.robot.end_effector(q) - motion.goal) < 2e-3
-        turned = arm.robot.hand_orientation(q[None])
-        assert np.rad2deg(apart(turned, motion.rollouts()[0].orientations[-1])).max() < 2
+        turned, wanted = arm.robot.hand_orientation(q[None]), motion.rollouts()[0].orientations
+        assert wanted is not None and np.rad2deg(apart(turned, wanted[-1:])).max() < 2
+
+    def test_a_task_is_placed_where_its_orientations_are_followed(self):
+        arm, aside = dt.load_arm("jaco"), Rotation.from_euler("x", 120, degrees=True)
+        takes = [replace(take, orientations=quaternions(aside * rotation(take.orientations))) for take in in_reach()]
+        off = []
+        for placed in (arm.place(takes), arm.place([replace(take, orientations=None) for take in takes])):
+            turned = [replace(one, orientations=take.orientations) for one, take in zip(placed, takes, strict=True)]
+            off.append(
+                max(np.max(joints.turned) for joints in arm.rollouts(dt.fit(turned)) if joints.turned is not None)
+            )
+        assert off[0] < 6 < off[1]

@@ -22,7 +22,7 @@ from dt_viz.ui.scene.arm import NUM_ARMS, SEEN, ArmPicture, Arms, ArmSequence, a
 from dt_viz.ui.scene.links import CELL, bodies, light_links, simplified
 from dt_viz.ui.scene.palette import LIGHT
 from dt_viz.ui.scene.picture import Arrows, Lines, Look
-from dt_viz.ui.scene.rollouts import Rollouts
+from dt_viz.ui.scene.rollouts import HandAxes, Rollouts
 from dt_viz.ui.scene.scene import OF_A_MOTION, OF_A_TASK, ScenePictures
 from dt_viz.ui.scene.style import STYLES
 from dt_viz.ui.tabs.plots import NUM_SAMPLES, JointPlots, joint_curves
@@ -248,6 +248,23 @@ def test_rollouts_of_another_scenario_are_grey_until_there_are_new_ones(drawn):
     fresh, stale = colours(()), colours(("the obstacle touches the base",))
     assert np.ptp(fresh, axis=1).min() > 60 and np.ptp(stale, axis=1).max() < 20
     np.testing.assert_array_equal(colours(()), fresh)
+
+
+def test_the_hands_axes_stand_along_the_motion_where_it_has_an_orientation(scene, monkeypatch):
+    picture, told, turned = HandAxes(scene), frame(), transforms.SO3.from_x_radians(0.5).as_matrix()
+    picture.draw(told, Look())
+    assert not picture.visible
+    places = np.linspace(0.0, 0.3, 21).reshape(7, 3)
+    monkeypatch.setattr(type(told), "hand_frames", lambda _, num: (places[:num], np.tile(turned, (num, 1, 1))))
+    picture.draw(told, Look())
+    assert picture.visible
+    for axis, along in zip(picture.axes, turned.T, strict=True):
+        np.testing.assert_allclose(axis.node.points[:, 0], places, atol=1e-6)
+        ends = axis.node.points[:, 1] - places
+        np.testing.assert_allclose(ends / np.linalg.norm(ends[0]), along[None].repeat(7, 0), atol=1e-5)
+    assert len({tuple(np.ravel(axis.node.colors)[:3]) for axis in picture.axes}) == 3
+    picture.draw(told, Look(blocked=True))
+    assert not picture.visible
 
 
 def is_grey(pictures):

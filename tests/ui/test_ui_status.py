@@ -14,7 +14,7 @@ from scenes import avoiding, beside, biases, changed
 from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.flows.diffeomorphisms import Integration
 from dt_viz.learning.demonstrations import DemonstrationError
-from dt_viz.motion.certificates import Certificates
+from dt_viz.motion.certificates import Certificates, HandTurn
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.robot.collision import NOTHING, CollisionReport, Nearest
 from dt_viz.scenario.paper_scenes import SCENES
@@ -174,6 +174,14 @@ def test_a_scenario_without_motion_says_why_and_what_is_shown_instead():
     assert "The obstacle touches the &lt;base&gt;" in details
     row = details.split(">Clearance<")[1].split("</tr>")[0]
     assert "–" in row and "mm" not in row
+
+
+def test_how_far_the_hand_is_turned_aside_is_said_where_it_has_an_orientation():
+    known = Certificates(0.02, turn=HandTurn(0.24, 7.6))
+    assert "Hand turned" not in details_of(frame(certificates=known))
+    row = details_of(frame(certificates=known, has_orientation=True)).split(">Hand turned<")[1].split("</tr>")[0]
+    assert "0.2°, at most 8°" in row
+    assert "–" in details_of(frame(has_orientation=True)).split(">Hand turned<")[1].split("</tr>")[0]
 
 
 def test_the_line_of_a_scene_is_shown_only_while_it_is_as_it_was():

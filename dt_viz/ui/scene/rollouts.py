@@ -64,6 +64,22 @@ class Ghost(_OutsideTubes):
         return [path for path, is_shown in zip(frame.ghost, shown, strict=True) if is_shown]
 
 
+class HandAxes(Picture):
+    """Frames of the hand along the rollout that the arm follows, where its orientation was learned."""
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        super().__init__(scene.add_frame("/rollouts/hands", show_axes=False, visible=False))
+        self.axes = [Lines(scene, f"/rollouts/hands/{name}", STYLES.hand_axis, k) for k, name in enumerate("xyz")]
+
+    def draw(self, frame: Frame, look: Look) -> None:
+        frames = None if look.blocked or frame.level is not None else frame.hand_frames(NUM_HANDS)
+        if frames is not None:
+            places, turned = frames
+            for k, axis in enumerate(self.axes):
+                axis.show_segments(np.stack([places, places + HAND_AXIS * turned[:, :, k]], axis=1), look.theme)
+        self.visible = frames is not None
+
+
 class Rollouts(Picture):
     """The rollouts as tubes: the one that the arm follows thick, the others thin and translucent."""
 
@@ -72,12 +88,7 @@ class Rollouts(Picture):
         self.followed = Tubes(scene, "/rollouts/followed", STYLES.followed)
         self.others = Tubes(scene, "/rollouts/others", STYLES.rollout)
         self.added = Tubes(scene, "/rollouts/added", STYLES.added)
-        self._axes = [Lines(scene, f"/rollouts/hand/{axis}", STYLES.hand_axis, k) for k, axis in enumerate("xyz")]
-        self._hide_axes()
-
-    def _hide_axes(self) -> None:
-        for axis in self._axes:
-            axis.node.visible = False
+        self.hands = HandAxes(scene)
 
     def draw(self, frame: Frame, look: Look) -> None:
         middles, theme = look.tubes.middles, look.theme
@@ -87,14 +98,7 @@ class Rollouts(Picture):
         # thinner beside those of a level
         self.others.show(middles[~added & ~followed], theme, scale=1.0 if frame.level is None else 0.7)
         self.added.show(middles[added & ~followed], theme)
-        frames = None if look.blocked or frame.level is not None else frame.hand_frames(NUM_HANDS)
-        if frames is None:
-            self._hide_axes()
-            return
-        places, turned = frames
-        for k, axis in enumerate(self._axes):
-            axis.show_segments(np.stack([places, places + HAND_AXIS * turned[:, :, k]], axis=1), theme)
-            axis.node.visible = True
+        self.hands.draw(frame, look)
 
 
 class LevelRollouts(Picture):
