@@ -200,6 +200,18 @@ def test_a_visitors_own_task_is_learned_for_that_visitor_alone(robot, fits):
         Engine(TASKS, fits, robot).task(first.name)
 
 
+def test_an_own_task_is_learned_as_it_was_seen_and_what_was_seen_is_no_warning(robot):
+    kept = replace(Choices().preparation, cut_pauses=False, smooth_jitter=False)
+    seen = preview(six(), replace(Choices(), preparation=kept), robot)
+    assert seen.task is not None
+    engine = Engine(TASKS, FitStore(None), robot)
+    *_, frame = engine.frames(Scenario(engine.bring(seen.task, "draw_s")[0].name, stack=()))
+    told = frame.motion.nominal.imitation.warnings
+    assert any("jitters" in text and "smoothed" not in text for text in told)
+    assert set(seen.task.seen) <= set(told)
+    assert not {str(warning) for warning in frame.certificates.warnings} & set(seen.task.seen)
+
+
 def test_own_tasks_are_few_and_the_one_that_is_shown_stays(robot):
     engine = Engine(TASKS, FitStore(None), robot)
     task, names, gone = own(robot), [], []

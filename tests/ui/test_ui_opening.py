@@ -140,7 +140,7 @@ def test_a_click_learns_what_is_seen_and_undo_goes_back(opened):
     assert dropdown.value == "Your data" and dropdown.options == (*(e.title for e in TASKS.values()), "Your data")
     assert opened["Learn"].disabled and opened.takes.visible  # until the motion is there
     visitor = opened.page.visitor
-    learning = Progress(session.scenario, shown=frame_of(session.scenario), learning=(0.5, "half"))
+    learning = Progress(session.scenario, shown=frame_of(session.scenario, task=task), learning=(0.5, "half"))
     visitor.tell(learning)
     assert opened.takes.visible
     visitor.tell(replace(learning, learning=None))
