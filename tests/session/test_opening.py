@@ -140,7 +140,12 @@ def test_of_several_goals_one_is_chosen_and_it_is_said_which(robot):
     recordings = Recordings(tuple(take(f"{k}", motion(goal=ends[k % 2])) for k in range(4)))
     for goal, end in enumerate(ends):
         seen = preview(recordings, Choices(goal=goal), robot)
-        assert len(seen.goals) == 2 and seen.task is not None and "'0', '2' at" in seen.goals[0]
+        assert (
+            seen.goal_number == goal
+            and len(seen.goals) == 2
+            and seen.task is not None
+            and "'0', '2' at" in seen.goals[0]
+        )
         np.testing.assert_array_equal(seen.goal, end)
         assert [one.learned is not None for one in seen.takes] == [k % 2 == goal for k in range(4)]
     assert preview(recordings, Choices(goal=9), robot).task is not None
