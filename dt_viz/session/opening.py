@@ -76,6 +76,8 @@ class Preview:
     """(3,) its goal, metres."""
     goals: tuple[str, ...] = ()
     """The goals, if there are several: what ends there, and where."""
+    goal_number: int = 0
+    """Number of the one that is learned."""
     unit: str = ""
     """Unit of lengths that is asked for; empty if it is clear."""
     rate: float | None = None
@@ -197,7 +199,7 @@ def _usable(takes: Sequence[Take], robot: Robot) -> tuple[list[Demonstration], l
 
 def _inspected(used: Sequence[Demonstration], choices: Choices, robot: Robot) -> Preview:
     chosen = [k for k in range(len(used)) if k not in choices.left_out]
-    settings, goals, problem = choices.preparation, (), ""
+    settings, goals, goal_number, problem = choices.preparation, (), 0, ""
     found: dict[int, Inspection] = {}
     numbers, motions = chosen, None
     try:
@@ -205,7 +207,8 @@ def _inspected(used: Sequence[Demonstration], choices: Choices, robot: Robot) ->
             numbers, motions = _prepared(used, chosen, settings, found)
         except NoCommonGoalError as error:
             goals = tuple(text for text, _ in error.goals)
-            settings = replace(settings, goal=error.goals[min(choices.goal, len(goals) - 1)][1])
+            goal_number = min(choices.goal, len(goals) - 1)
+            settings = replace(settings, goal=error.goals[goal_number][1])
             numbers, motions = _prepared(used, chosen, settings, found)
     except ImitationError as error:
         problem = str(error) if chosen else "Every take is left out; choose at least one."
@@ -227,8 +230,8 @@ def _inspected(used: Sequence[Demonstration], choices: Choices, robot: Robot) ->
         for k, own in enumerate(used)
     )
     if motions is None:
-        return Preview(takes, goals=goals, problem=problem)
-    return Preview(takes, task, task.to_world(motions.goal), goals)
+        return Preview(takes, goals=goals, goal_number=goal_number, problem=problem)
+    return Preview(takes, task, task.to_world(motions.goal), goals, goal_number)
 
 
 def _prepared(

@@ -140,7 +140,12 @@ def test_of_several_goals_one_is_chosen_and_it_is_said_which(robot):
     recordings = Recordings(tuple(take(f"{k}", motion(goal=ends[k % 2])) for k in range(4)))
     for goal, end in enumerate(ends):
         seen = preview(recordings, Choices(goal=goal), robot)
-        assert len(seen.goals) == 2 and seen.task is not None and "'0', '2' at" in seen.goals[0]
+        assert (
+            seen.goal_number == goal
+            and len(seen.goals) == 2
+            and seen.task is not None
+            and "'0', '2' at" in seen.goals[0]
+        )
         np.testing.assert_array_equal(seen.goal, end)
         assert [one.learned is not None for one in seen.takes] == [k % 2 == goal for k in range(4)]
     assert preview(recordings, Choices(goal=9), robot).task is not None
@@ -198,6 +203,18 @@ def test_a_visitors_own_task_is_learned_for_that_visitor_alone(robot, fits):
     assert dict(fits._memory) == stored  # nothing of it is kept for others, or on the disk
     with pytest.raises(KeyError):
         Engine(TASKS, fits, robot).task(first.name)
+
+
+def test_an_own_task_is_learned_as_it_was_seen_and_what_was_seen_is_no_warning(robot):
+    kept = replace(Choices().preparation, cut_pauses=False, smooth_jitter=False)
+    seen = preview(six(), replace(Choices(), preparation=kept), robot)
+    assert seen.task is not None
+    engine = Engine(TASKS, FitStore(None), robot)
+    *_, frame = engine.frames(Scenario(engine.bring(seen.task, "draw_s")[0].name, stack=()))
+    told = frame.motion.nominal.imitation.warnings
+    assert any("jitters" in text and "smoothed" not in text for text in told)
+    assert set(seen.task.seen) <= set(told)
+    assert not {str(warning) for warning in frame.certificates.warnings} & set(seen.task.seen)
 
 
 def test_own_tasks_are_few_and_the_one_that_is_shown_stays(robot):

@@ -18,7 +18,7 @@ from dt_viz.session.session import CHOICES
 from dt_viz.ui.scene.palette import LIGHT
 from dt_viz.ui.tabs import opening
 from dt_viz.ui.tabs.from_file import LANE
-from dt_viz.ui.tabs.opening import SEEING, SWITCHES
+from dt_viz.ui.tabs.opening import CHOOSING, SEEING, SWITCHES
 
 RNG = np.random.default_rng(2)
 GOAL = np.array([0.2, -0.45, 0.3])
@@ -56,6 +56,7 @@ class Opening:
 
     def open(self):
         self.page.claim(self["Open your demonstrations"], True)
+        self.done()
 
     def add(self, name, content):
         self.page.claim(self["Choose files, or drop them here"], viser.UploadedFile(name, content))
@@ -66,7 +67,7 @@ class Opening:
         self.done()
 
     def done(self):
-        for lane in (LANE, SEEING, CHOICES):
+        for lane in (CHOOSING, LANE, SEEING, CHOICES):
             assert self.page.session.jobs.wait_idle(lane, PATIENCE)
 
     @property
@@ -102,7 +103,7 @@ def test_what_is_opened_is_seen_in_place_of_the_motion_until_it_is_cancelled(ope
     assert not {"Cut pauses", "Goal", "Unit", "Rate", "Topic", "Column of x", "Scale to fit"} & opened.labels()
     visible = opened.page.visitor.pictures._always[-1]
     assert not visible.visible
-    opened.page.claim(opened["Cancel"], True)
+    opened.choose("Cancel", True)
     assert not opened.takes.visible and visible.visible and opened["Learn"].disabled
     assert {"Smooth jitter", "Use this take"}.isdisjoint(opened.labels())
     assert opened.page.session.scenario.task == "draw_s"
@@ -131,8 +132,7 @@ def test_switches_and_takes_are_chosen(opened):
 def test_a_click_learns_what_is_seen_and_undo_goes_back(opened):
     opened.add("a.zip", zipped(a=csv(jitter=0.002), b=csv(), c=csv()))
     opened.choose("Smooth jitter", False)
-    opened.page.claim(opened["Learn"], True)
-    opened.done()
+    opened.choose("Learn", True)
     session, dropdown = opened.page.session, opened["Task"]
     task = session.task
     assert session.scenario.task == task.name == "own_data_1" and len(task.demonstrations) == 3
@@ -140,7 +140,7 @@ def test_a_click_learns_what_is_seen_and_undo_goes_back(opened):
     assert dropdown.value == "Your data" and dropdown.options == (*(e.title for e in TASKS.values()), "Your data")
     assert opened["Learn"].disabled and opened.takes.visible  # until the motion is there
     visitor = opened.page.visitor
-    learning = Progress(session.scenario, shown=frame_of(session.scenario), learning=(0.5, "half"))
+    learning = Progress(session.scenario, shown=frame_of(session.scenario, task=task), learning=(0.5, "half"))
     visitor.tell(learning)
     assert opened.takes.visible
     visitor.tell(replace(learning, learning=None))
@@ -184,7 +184,7 @@ def test_more_than_a_visitor_may_hold_is_refused(opened):
 
 def test_what_is_not_clear_is_asked_for_and_answered(opened):
     opened.add("mm.csv", csv(size=1000.0, timed=False).replace(b"x,y,z", b"a,b,c"))
-    assert {"Unit", "Rate", "Column of x", "Column of times"} <= opened.labels()
+    assert {"Unit", "Rate", "Column of x", "Column of t"} <= opened.labels()
     assert (opened["Unit"].value, opened["Rate"].value, opened["Column of y"].value) == ("mm", "50 Hz", "b")
     np.testing.assert_allclose(opened.takes.goal.position, GOAL, atol=0.01)
     opened.choose("Unit", "cm")
@@ -256,7 +256,7 @@ def test_forged_values_are_refused(opened, claim):
 
 def test_a_file_for_a_folder_that_is_hidden_is_not_read(opened):
     upload = opened["Choose files, or drop them here"]
-    opened.page.claim(opened["Cancel"], True)
+    opened.choose("Cancel", True)
     opened.page.claim(upload, viser.UploadedFile("a.csv", csv()))
     opened.done()
     assert not opened.takes.visible and opened.told == []
@@ -273,11 +273,12 @@ def test_two_visitors_open_at_the_same_instant_and_each_sees_its_own(robot, open
     other = Page(beside, robot)
     try:
         other.claim(other["Open your demonstrations"], True)
+        assert other.session.jobs.wait_idle(CHOOSING, PATIENCE)
         label = "Choose files, or drop them here"
         opened.page.claim(opened[label], viser.UploadedFile("a.csv", csv()))
         other.claim(other[label], viser.UploadedFile("b.zip", zipped(b=csv(), c=csv())))
         opened.done()
-        for lane in (LANE, SEEING):
+        for lane in (CHOOSING, LANE, SEEING):
             assert other.session.jobs.wait_idle(lane, PATIENCE)
         wait_until(lambda: opened.takes.visible and other.visitor.pictures._takes.visible)
         assert opened.takes.name.text == "a" and other.visitor.pictures._takes.name.text == "b"

@@ -20,7 +20,7 @@ from dt_viz.session import opening
 from dt_viz.session.opening import LENGTHS, USUAL_RATES, Choices, Preview
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import Bindings
-from dt_viz.ui.controls import Control, on_press
+from dt_viz.ui.controls import Control
 from dt_viz.ui.dropping import drop_html
 from dt_viz.ui.scene.palette import LIGHT
 from dt_viz.ui.tabs.from_file import LANE, turn
@@ -42,8 +42,8 @@ SWITCHES: Mapping[FindingKind, tuple[str, str, str]] = {
     ),
 }
 """What is done about a kind of finding: the field of `PreparationSettings`, label and hint of its switch."""
-SEEING = "preview"
-"""Lane of the session's jobs on which what is open is inspected."""
+CHOOSING, SEEING = "opening", "preview"
+"""Lanes of the session's jobs on which what is open is changed, and on which it is inspected."""
 READINGS = {"t,x,y": "times", "x,y,z": "x, as the next ones are y and z"}
 """What the first of three columns without names is, by the reading of all three."""
 
@@ -99,30 +99,39 @@ class OpenPanel:
             self.controls = self._add_controls(gui)
             start = gui.add_button("Learn", icon=viser.Icon.SCHOOL, color=LIGHT.brand, disabled=True)
             cancel = gui.add_button("Cancel", icon=viser.Icon.X, color="gray")
-        self.controls["open"] = Control(begin, lambda _pressed: self.open())
-        self.controls["learn"] = Control(start, lambda _pressed: self._press())
-        on_press(cancel, self.close)
+        self.controls["open"] = self._control(begin, lambda _pressed: self.open())
+        self.controls["learn"] = self._control(start, lambda _pressed: self._press())
+        self._control(cancel, lambda _pressed: self.close())
         bindings.show(lambda s: (s.task, s.scene), lambda _chosen: self.close())
 
         @self.upload.on_upload
         async def _(_event: viser.GuiEvent) -> None:
-            self.load(self.upload.value.name, self.upload.value.content)
+            file = self.upload.value
+            self._later(partial(self.load, file.name, file.content))
+
+    def _later(self, work: Callable[[], None]) -> None:
+        """Do work on what is open, one after the other, beside the server's event loop."""
+        self._bindings.session.jobs.submit(CHOOSING, work)
+
+    def _control(self, handle: Any, act: Callable[[Any], None]) -> Control:  # noqa: ANN401 - handles of all kinds
+        """Act on each value of an input, or press of a button."""
+        return Control(handle, lambda value: self._later(partial(act, value)))
 
     def _add_controls(self, gui: viser.GuiApi) -> dict[str, Control]:
         """Build what is shown only where it is asked for, by names of their own."""
         at, found = self._choose, {}
 
         def dropdown(name: str, label: str, options: tuple[str, ...], act: Callable[[str], Any], hint: str) -> None:
-            found[name] = Control(gui.add_dropdown(label, options, hint=hint, visible=False), act)
+            found[name] = self._control(gui.add_dropdown(label, options, hint=hint, visible=False), act)
 
         dropdown("take", "Take", (NO_COLUMN,), self._point, "the take that is named in the scene")
         box = gui.add_checkbox("Use this take", True, visible=False)
-        found["chosen"] = Control(box, self._leave_out)
+        found["chosen"] = self._control(box, self._leave_out)
         for kind, (name, label, hint) in SWITCHES.items():
             box = gui.add_checkbox(label, True, hint=hint, visible=False)
-            found[kind] = Control(box, lambda on, name=name: at(lambda c: {"preparation": _with(c, name, on)}))
+            found[kind] = self._control(box, lambda on, name=name: at(lambda c: {"preparation": _with(c, name, on)}))
         box = gui.add_checkbox("Scale to fit", False, hint="into the arm's reach", visible=False)
-        found["reach"] = Control(box, lambda on: at(lambda _: {"fits_reach": on}))
+        found["reach"] = self._control(box, lambda on: at(lambda _: {"fits_reach": on}))
         hint = "the place at which motions end; takes that end elsewhere are left out"
         dropdown("goal", "Goal", ("1",), lambda goal: at(lambda _: {"goal": int(goal.split()[0]) - 1}), hint)
         dropdown("unit", "Unit", LENGTHS, lambda unit: at(lambda _: {"unit": unit}), "of positions in files")
@@ -133,16 +142,16 @@ class OpenPanel:
         first = {label: reading for reading, label in READINGS.items()}
         dropdown("reading", "First column", tuple(first), lambda label: self._answer("reading", first[label]), hint)
         for axis in AXES:
-            hint = "the column with it"
+            hint = "the column with it; without times (t) there is a rate, without z it is a drawing in the plane"
             answer = partial(self._answer_axis, axis)
-            dropdown(axis, f"Column of {'times' if axis == 't' else axis}", (NO_COLUMN,), answer, hint)
+            dropdown(axis, f"Column of {axis}", (NO_COLUMN,), answer, hint)
         dropdown("topic", "Topic", (NO_COLUMN,), partial(self._answer, "topic"), "of the bag, or frame, of the hand")
         return found
 
     def open(self) -> None:
         """Show the folder, and get ready for files."""
         self.folder.visible, self.controls["open"].handle.visible = True, False
-        self._bindings.session.jobs.submit("ready", make_ready)  # a lane of its own: that of files must be free for one
+        make_ready()
 
     def close(self, *, learns: bool = False) -> None:
         """Let go of what is open, and show what was shown before, or what it `learns` once that is known."""
@@ -257,7 +266,8 @@ class OpenPanel:
             task = None if self._seen is None else self._seen.task
             if task is not None:
                 self.close(learns=True)
-                self._learn(self._bindings.session, task)
+        if task is not None:
+            self._learn(self._bindings.session, task)
 
     # --- what is shown ---
 
@@ -280,7 +290,7 @@ class OpenPanel:
             self._turn(kind, on, shown=kind in found or not on)
         self._turn("reach", opened.choices.fits_reach, shown=bool(seen.reach))
         goals = tuple(f"{k} · {text}"[:60] for k, text in enumerate(seen.goals, 1))
-        self._offer("goal", goals, goals[min(opened.choices.goal, len(goals) - 1)] if goals else "")
+        self._offer("goal", goals, goals[seen.goal_number] if goals else "")
         self._offer("unit", LENGTHS if seen.unit else (), seen.unit)
         rates = tuple(f"{rate:g} Hz" for rate in USUAL_RATES)
         self._offer("rate", rates if seen.rate else (), f"{seen.rate or 0:g} Hz")

@@ -9,7 +9,7 @@ from dt_viz.learning.inspection import FindingKind
 from dt_viz.session.opening import Preview, SeenTake
 from dt_viz.ui.scene.palette import LIGHT, css, ink
 from dt_viz.ui.tabs.plots import small
-from dt_viz.ui.tabs.status import COLOURS
+from dt_viz.ui.tabs.status import COLOURS, sentence
 from dt_viz.warning import Severity
 
 HEADS: Mapping[FindingKind, tuple[str, str]] = {
@@ -26,10 +26,13 @@ HEADS: Mapping[FindingKind, tuple[str, str]] = {
 
 def seen_html(seen: Preview, number: int) -> str:
     """Return a table of what was found of each take, the chosen one marked, and what else is to be known."""
-    several = f"The takes end at {len(seen.goals)} places, none of them that of most: “Goal” chooses one."
-    alarms = [text for text in (seen.problem, seen.reach, several if seen.goals else "") if text]
-    told = [f"<div style='color:{ink(COLOURS[Severity.WARNING][0])}'>{html.escape(text)}</div>" for text in alarms]
-    told += [f"<div>{html.escape(note)}</div>" for note in seen.notes]
+    alarms = [text for text in (seen.problem, seen.reach) if text]
+    if seen.goals:
+        goal = f"learned are {seen.goals[seen.goal_number]}; “Goal” chooses others"
+        alarms.append(f"the takes end at {len(seen.goals)} places, none of them that of most: {goal}")
+    colours = [ink(COLOURS[Severity.WARNING][0])] * len(alarms) + ["inherit"] * len(seen.notes)
+    said = zip(colours, (*alarms, *seen.notes), strict=True)
+    told = [f"<div style='color:{colour}'>{html.escape(sentence(text))}</div>" for colour, text in said]
     found = {finding.kind for take in seen.takes if take.learned is not None for finding in take.inspection.findings}
     heads: list[FindingKind] = [kind for kind in HEADS if kind in found]
     rows = "".join(_row(k, take, heads, chosen=k == number) for k, take in enumerate(seen.takes))
