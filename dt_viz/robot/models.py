@@ -259,14 +259,14 @@ class _Given:
         told = [text.encode(), repr(chosen).encode(), self.srdf.read_bytes() if self.srdf else b""]
         materials = (path for file in files if file.suffix.lower() == ".obj" for path in file.parent.glob("*.mtl"))
         key = arm_cache.digest([*told, *(file.read_bytes() for file in (*files, *sorted(materials)))])
-        stored = default_cache_folder() / "arms" / f"{key}.npz"
+        archive = default_cache_folder() / "arms" / f"{key}.npz"
         names = {"name": name, "title": self.title or name, "urdf": self.urdf, "package_dirs": self.package_dirs}
-        robot = arm_cache.read(stored, names)
+        robot = arm_cache.read(archive, names)
         if robot is None:
             if stored:
                 raise NotStoredError(name)
             robot = self._robot(semantic, chain, text, name, None, tell)
-            arm_cache.write(stored, robot)
+            arm_cache.write(archive, robot)
         tell(1.0, "")
         return robot
 
