@@ -50,30 +50,32 @@ def load_aside(name: str, progress: Progress) -> Robot:
 
 
 def _make(name: str, progress: Progress) -> None:
-    """Have a process make an arm and store it. Raises ArmError if that refuses it; another end is not told."""
-    process = start_module(__name__, name, output=subprocess.PIPE)
-    told, done = [0.0, "starting"], threading.Event()
+    """Have a process make an arm and store it. Raises ArmError if that refuses it, or ends by something else."""
+    process, told = start_module(__name__, name, output=subprocess.PIPE), [0.0, "starting"]
+    pipe = process.stdout
+    assert pipe is not None
 
     def listen() -> None:
-        assert process.stdout is not None
         with suppress(ValueError):  # something else than JSON
-            for line in process.stdout:
+            for line in pipe:
                 told[:] = json.loads(line)
-        done.set()
 
     listening = threading.Thread(target=listen, name="making", daemon=True)
     listening.start()
     try:
-        while not done.wait(LOOK):
+        while listening.is_alive():
             progress(*told)
+            listening.join(LOOK)
+        process.wait()
     finally:
         process.kill()
-        process.wait()
         listening.join()
-        assert process.stdout is not None
-        process.stdout.close()
+        pipe.close()
+        process.wait()
     if len(told) == len(ArmError("", "", "", "").args):
         raise ArmError(*told)
+    if process.returncode:
+        raise ArmError(name, "files", f"something that ended their reader ({process.returncode})", "whole files")
 
 
 def main() -> None:

@@ -75,7 +75,7 @@ class PaperScene:
 
     def is_changed(self, scenario: Scenario, task: Task) -> bool:
         """Return whether the stack differs from the scene's own."""
-        free = {name: getattr(scenario, name) for name in ("warp", "starts", "arm_rollout")}
+        free = {name: getattr(scenario, name) for name in ("arm", "warp", "starts", "arm_rollout")}
         return scenario.choices != replace(self.scenario(task), **free).choices
 
 
@@ -105,18 +105,20 @@ def _bottle_in_the_way(task: Task) -> Scenario:
     """Fig. 1 and 7: a standing bottle in the path, given way to by the whole arm."""
     beside_the_box = {"lift_box": 34, "push_box": 55}  # percent of the motion's length
     x, y, _ = task.mean_path[beside_the_box[task.name]]
-    return _avoiding(task, ArmAvoidance(MeshObstacle((float(x), float(y), 0.0), bottle())))
+    return _avoiding(task, ArmAvoidance(MeshObstacle((float(x), float(y), 0.0), bottle(), scale=task.size)))
 
 
 def _sphere_in_the_letter(diameter: float) -> Callable[[Task], Scenario]:
     """Return what makes the scenario of fig. 2."""
-    return lambda task: _avoiding(task, Avoidance(Sphere(task.obstacle_position, diameter), plane=plane_of(task)))
+    return lambda task: _avoiding(
+        task, Avoidance(Sphere(task.obstacle_position, task.size * diameter), plane=plane_of(task))
+    )
 
 
 def _cube_before_the_attractor(task: Task) -> Scenario:
     """Fig. 3 (a): motions that are straight but for a cube of 10 cm."""
     middle = (task.starts.mean(axis=0) + task.mean_path[-1]) / 2
-    cube = Box(as_point(middle), (0.10, 0.10, 0.10))
+    cube = Box(as_point(middle), (0.10 * task.size,) * 3)
     return replace(_avoiding(task, Avoidance(cube, plane=plane_of(task))), imitation=False)
 
 
@@ -166,14 +168,14 @@ CLOVER = Clover()
 
 def _cloud_in_the_letter(task: Task) -> Scenario:
     """Sec. 4.4."""
-    return _avoiding(task, Avoidance(CloudObstacle(task.obstacle_position, CLOVER.cloud)))
+    return _avoiding(task, Avoidance(CloudObstacle(task.obstacle_position, CLOVER.cloud, scale=task.size)))
 
 
 def _two_points(task: Task) -> Scenario:
     """Fig. 4."""
     mean, plane = task.mean_path, plane_of(task)
     offsets = {30: (0.05, 0.0), 70: (0.0, -0.03)}  # to the right and up, metres, by the percent of its length
-    places = [mean[at] + task.slice.axes @ offset for at, offset in offsets.items()]
+    places = [mean[at] + task.size * task.slice.axes @ offset for at, offset in offsets.items()]
     return _biased(task, *(BiasPoint(as_point(place), plane=plane) for place in places))
 
 

@@ -7,7 +7,13 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 
-from dt_viz.robot.inverse_kinematics import UnreachableError
+import numpy as np
+
+from dt_viz.avoidance.arm import WholeArm
+from dt_viz.numerics import unit
+from dt_viz.obstacles.shapes import Sphere, as_point
+from dt_viz.obstacles.union import Union
+from dt_viz.robot.inverse_kinematics import UnreachableError, inverse_kinematics
 from dt_viz.robot.placement import is_jaco, place
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.tasks import Task, TaskEntry
@@ -34,8 +40,28 @@ def _placed(entry: TaskEntry, robot: Robot) -> Task:
     for on_table in (True, False) if task.on_table else (False,):
         try:
             placement = place(robot, task.paths, on_table=on_table)
-            return task.placed(placement.scale, placement.shift)
+            placed = task.placed(placement.scale, placement.shift)
+            return _freed(placed, robot) if task.on_table else placed
         except UnreachableError as error:
             reason = error
     logger.warning("%s: %s", entry.title, reason)
+    return task
+
+
+def _freed(task: Task, robot: Robot, room: float = 0.01, step: float = 0.01, most: int = 20) -> Task:
+    """Return a task whose first obstacle does not touch the arm at the goal: it is moved away from that, step by step.
+
+    Args:
+        task: placed for the arm.
+        robot: the arm.
+        room: distance that is left, metres.
+        step: length of a step, metres.
+        most: largest number of steps.
+    """
+    goal, place = np.mean([path[-1] for path in task.paths], axis=0), np.array(task.obstacle_position)
+    posture, arm = inverse_kinematics(robot, goal), WholeArm(robot)
+    for k in range(most):
+        there = as_point(place + k * step * unit(place - goal))
+        if arm.clearance(posture[None], Union((Sphere(there, task.size * Sphere.diameter),))).min() > room:
+            return replace(task, obstacle_position=there)
     return task
