@@ -14,9 +14,13 @@ def scales(default: float, power: float = 1) -> Any:  # noqa: ANN401 - as `datac
     return field(default=default, metadata={"metres": power})
 
 
-@lru_cache(maxsize=64)
 def sized(settings: _Settings, size: float) -> _Settings:
     """Settings, a frozen dataclass, for an arm whose reach is `size` times the JACO's."""
-    powers: dict[str, float] = {own.name: own.metadata.get("metres", 0) for own in fields(settings)}  # pyright: ignore
+    return _sized(settings, size)
+
+
+@lru_cache(maxsize=64)
+def _sized(settings: Any, size: float) -> Any:  # noqa: ANN401 - as `sized`
+    powers: dict[str, float] = {own.name: own.metadata.get("metres", 0) for own in fields(settings)}
     scaled = {name: getattr(settings, name) * size**power for name, power in powers.items() if power}
-    return replace(settings, **scaled)  # pyright: ignore
+    return replace(settings, **scaled)

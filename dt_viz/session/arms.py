@@ -90,8 +90,10 @@ class Engines:
         """The engine for an arm; raises as `ArmStore.engine`."""
         engine = self.get(arm) or self._new(arm, progress)
         with self._lock:
-            engine = self._known.get(arm, engine)  # the first of two that were made at once
-            engine.adopt(next(iter(self._known.values())).own)
+            if arm in self._known:
+                engine = self._known[arm]  # the first of two that were made at once
+            else:
+                engine.adopt(next(iter(self._known.values())).own)
             others = [(name, known) for name, known in self._known.items() if name != arm]
             self._known = dict([*others[-1:], (arm, engine)])
         return engine

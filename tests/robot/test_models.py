@@ -180,9 +180,9 @@ def test_courses_of_an_arm_whose_postures_are_not_unique_end_where_its_motions_d
 
 
 def test_the_jaco_in_the_cache_is_the_one_that_was_made(robot, monkeypatch):
-    models._load("jaco", None)  # into this module's cache
+    models._load("jaco", None, stored=False)  # into this module's cache
     monkeypatch.setattr(models._Given, "_robot", lambda *_: pytest.fail("it is made again"))
-    again = models._load("jaco", None)
+    again = models._load("jaco", None, stored=True)
     made, kept = to_arrays(robot), to_arrays(again)
     assert made.keys() == kept.keys()
     for name, values in made.items():
