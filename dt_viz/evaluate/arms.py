@@ -24,6 +24,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
@@ -52,7 +53,7 @@ from dt_viz.robot.inverse_kinematics import UnreachableError
 from dt_viz.robot.models import ARMS
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import with_avoidance
-from dt_viz.scenario.tasks import TASKS
+from dt_viz.scenario.tasks import TASKS, Task
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Stage
 
@@ -115,7 +116,7 @@ def run(options: argparse.Namespace) -> int:
     rows, arrays = [], {}
     for arm, engine in engines.items():
         robot, passages = engine.follower.robot, []
-        row = {"arm": robot.title, "joints": robot.num_joints, "reach m": robot.reach}
+        row: dict[str, Any] = {"arm": robot.title, "joints": robot.num_joints, "reach m": robot.reach}
         row |= _loading(arm, first=options.first_load) | _following(engine, options.task)
         for passage in _passages(engine, options):
             print(f"{arm} {len(passages)} {passage}", flush=True)
@@ -165,15 +166,12 @@ def _passages(engine: Engine, options: argparse.Namespace) -> Iterator[Passage]:
     """Measure so many balls."""
     rng, robot = np.random.default_rng(options.seed), engine.follower.robot
     for _ in range(options.count):
-        name, again, postures = str(rng.choice(options.task)), -1, None
-        task, nominal = engine.task(name), engine.nominal(Scenario(name))
-        q = engine.follower.undisturbed(nominal).tracked.q.reshape(-1, robot.num_joints)
-        while postures is None:
-            avoidance, again = ArmAvoidance(_ball(engine, q, rng, options.size)), again + 1
-            postures = postures_at(robot, nominal.learned.demonstrated.ends, avoidance, rng)
-        (ball,), place = avoidance.obstacles, measured(engine, task, avoidance)
+        task = engine.task(str(rng.choice(options.task)))
+        ball, postures, again = _passable_ball(engine, task, rng, options.size)
+        avoidance = ArmAvoidance(ball)
+        place = measured(engine, task, avoidance)
         values = (*ball.position, ball.radius), again, len(place.ends) - 1, len(place.rollouts)
-        passage = Passage(name, *values, avoidance.margin - place.clearance, place.clearance)
+        passage = Passage(task.name, *values, avoidance.margin - place.clearance, place.clearance)
         if place.motions:
             joints, goal = _in_the_loop(engine, avoiding(task, avoidance), int(rng.choice([*place.motions])))
             missed = float(np.linalg.norm(robot.end_effector(joints[-1]) - goal))
@@ -181,6 +179,21 @@ def _passages(engine: Engine, options: argparse.Namespace) -> Iterator[Passage]:
         if not passage.is_cleared:
             passage = replace(passage, has_way=has_way(robot, ball, avoidance.margin, postures))
         yield passage
+
+
+def _passable_ball(
+    engine: Engine, task: Task, rng: np.random.Generator, size: tuple[float, float]
+) -> tuple[Sphere, Array, int]:
+    """Draw a ball; postures (R + 1, n), rad, beside it at starts and goal; how many before it cannot be passed."""
+    nominal, robot = engine.nominal(Scenario(task.name)), engine.follower.robot
+    q = engine.follower.undisturbed(nominal).tracked.q.reshape(-1, robot.num_joints)
+    again = 0
+    while True:
+        ball = _ball(engine, q, rng, size)
+        postures = postures_at(robot, nominal.learned.demonstrated.ends, ArmAvoidance(ball), rng)
+        if postures is not None:
+            return ball, postures, again
+        again += 1
 
 
 def _ball(engine: Engine, q: Array, rng: np.random.Generator, size: tuple[float, float]) -> Sphere:
