@@ -32,7 +32,6 @@ from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.control.controller import ArmController
 from dt_viz.evaluate.around import ALLOWANCE, in_ball, measured
 from dt_viz.evaluate.options import (
-    Row,
     avoiding,
     interval,
     new_engine,
@@ -116,7 +115,7 @@ def run(options: argparse.Namespace) -> int:
     rows, arrays = [], {}
     for arm, engine in engines.items():
         robot, passages = engine.follower.robot, []
-        row: dict[str, Any] = {"arm": robot.title, "joints": robot.num_joints, "reach m": robot.reach}
+        row = {"arm": robot.title, "joints": robot.num_joints, "reach m": robot.reach}
         row |= _loading(arm, first=options.first_load) | _following(engine, options.task)
         for passage in _passages(engine, options):
             print(f"{arm} {len(passages)} {passage}", flush=True)
@@ -132,7 +131,7 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _loading(arm: str, *, first: bool) -> Row:
+def _loading(arm: str, *, first: bool) -> dict[str, Any]:
     """Seconds that processes of their own load an arm in: from the user's cache folder, and with an empty one."""
     code = "import sys, time; from dt_viz.robot.models import load_arm; began = time.perf_counter()\n"
     code += "load_arm(sys.argv[1]); print(time.perf_counter() - began)"
@@ -148,7 +147,7 @@ def _loading(arm: str, *, first: bool) -> Row:
         return {"load s": cached, "first s": seconds(XDG_CACHE_HOME=empty) if first else None}
 
 
-def _following(engine: Engine, tasks: Sequence[str]) -> Row:
+def _following(engine: Engine, tasks: Sequence[str]) -> dict[str, Any]:
     """How many tasks the arm follows, by how much it misses them at most, and at which scale they are at least."""
     worst, scales = [], []
     for name in tasks:
@@ -240,7 +239,7 @@ def _drag(engine: Engine, name: str, diameter: float) -> Iterator[float]:
         passing = frame.passing
 
 
-def _row(passages: Sequence[Passage]) -> Row:
+def _row(passages: Sequence[Passage]) -> dict[str, Any]:
     """Row of the table, as far as balls go."""
     num = len(passages)
     return {
