@@ -24,6 +24,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
@@ -31,7 +32,6 @@ from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.control.controller import ArmController
 from dt_viz.evaluate.around import ALLOWANCE, in_ball, measured
 from dt_viz.evaluate.options import (
-    Row,
     avoiding,
     interval,
     new_engine,
@@ -52,7 +52,7 @@ from dt_viz.robot.inverse_kinematics import UnreachableError
 from dt_viz.robot.models import ARMS
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import with_avoidance
-from dt_viz.scenario.tasks import TASKS
+from dt_viz.scenario.tasks import TASKS, Task
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Stage
 
@@ -131,7 +131,7 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _loading(arm: str, *, first: bool) -> Row:
+def _loading(arm: str, *, first: bool) -> dict[str, Any]:
     """Seconds that processes of their own load an arm in: from the user's cache folder, and with an empty one."""
     code = "import sys, time; from dt_viz.robot.models import load_arm; began = time.perf_counter()\n"
     code += "load_arm(sys.argv[1]); print(time.perf_counter() - began)"
@@ -147,7 +147,7 @@ def _loading(arm: str, *, first: bool) -> Row:
         return {"load s": cached, "first s": seconds(XDG_CACHE_HOME=empty) if first else None}
 
 
-def _following(engine: Engine, tasks: Sequence[str]) -> Row:
+def _following(engine: Engine, tasks: Sequence[str]) -> dict[str, Any]:
     """How many tasks the arm follows, by how much it misses them at most, and at which scale they are at least."""
     worst, scales = [], []
     for name in tasks:
@@ -165,15 +165,12 @@ def _passages(engine: Engine, options: argparse.Namespace) -> Iterator[Passage]:
     """Measure so many balls."""
     rng, robot = np.random.default_rng(options.seed), engine.follower.robot
     for _ in range(options.count):
-        name, again, postures = str(rng.choice(options.task)), -1, None
-        task, nominal = engine.task(name), engine.nominal(Scenario(name))
-        q = engine.follower.undisturbed(nominal).tracked.q.reshape(-1, robot.num_joints)
-        while postures is None:
-            avoidance, again = ArmAvoidance(_ball(engine, q, rng, options.size)), again + 1
-            postures = postures_at(robot, nominal.learned.demonstrated.ends, avoidance, rng)
-        (ball,), place = avoidance.obstacles, measured(engine, task, avoidance)
+        task = engine.task(str(rng.choice(options.task)))
+        ball, postures, again = _passable_ball(engine, task, rng, options.size)
+        avoidance = ArmAvoidance(ball)
+        place = measured(engine, task, avoidance)
         values = (*ball.position, ball.radius), again, len(place.ends) - 1, len(place.rollouts)
-        passage = Passage(name, *values, avoidance.margin - place.clearance, place.clearance)
+        passage = Passage(task.name, *values, avoidance.margin - place.clearance, place.clearance)
         if place.motions:
             joints, goal = _in_the_loop(engine, avoiding(task, avoidance), int(rng.choice([*place.motions])))
             missed = float(np.linalg.norm(robot.end_effector(joints[-1]) - goal))
@@ -181,6 +178,21 @@ def _passages(engine: Engine, options: argparse.Namespace) -> Iterator[Passage]:
         if not passage.is_cleared:
             passage = replace(passage, has_way=has_way(robot, ball, avoidance.margin, postures))
         yield passage
+
+
+def _passable_ball(
+    engine: Engine, task: Task, rng: np.random.Generator, size: tuple[float, float]
+) -> tuple[Sphere, Array, int]:
+    """Draw a ball; postures (R + 1, n), rad, beside it at starts and goal; how many before it cannot be passed."""
+    nominal, robot = engine.nominal(Scenario(task.name)), engine.follower.robot
+    q = engine.follower.undisturbed(nominal).tracked.q.reshape(-1, robot.num_joints)
+    again = 0
+    while True:
+        ball = _ball(engine, q, rng, size)
+        postures = postures_at(robot, nominal.learned.demonstrated.ends, ArmAvoidance(ball), rng)
+        if postures is not None:
+            return ball, postures, again
+        again += 1
 
 
 def _ball(engine: Engine, q: Array, rng: np.random.Generator, size: tuple[float, float]) -> Sphere:
@@ -227,7 +239,7 @@ def _drag(engine: Engine, name: str, diameter: float) -> Iterator[float]:
         passing = frame.passing
 
 
-def _row(passages: Sequence[Passage]) -> Row:
+def _row(passages: Sequence[Passage]) -> dict[str, Any]:
     """Row of the table, as far as balls go."""
     num = len(passages)
     return {

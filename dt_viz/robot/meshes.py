@@ -45,7 +45,7 @@ def cells(points: Array, size: float) -> Indices:
     """Number the cells of a grid (N,), in the order of their places, that points (N, 3) are in."""
     cell = np.floor(points / size).astype(np.intp)
     cell -= cell.min(axis=0)
-    return np.array(np.ravel_multi_index(tuple(cell.T), tuple(cell.max(axis=0) + 1)))
+    return np.asarray(np.ravel_multi_index(tuple(cell.T), tuple(cell.max(axis=0) + 1)))
 
 
 def constant(values: ArrayLike, dtype: DTypeLike = float) -> NDArray[Any]:

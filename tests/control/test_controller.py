@@ -267,7 +267,7 @@ class TestDisturbances:
             """The arm, staying near another posture."""
 
             robot, whole_arm = scene.engine.follower.robot, scene.engine.follower.whole_arm
-            body = scene.engine.follower.robot.body
+            body, at_ends = scene.engine.follower.robot.body, scene.engine.follower.at_ends
 
             def reference(self, nominal):
                 return scene.engine.follower.reference(nominal) + offset
