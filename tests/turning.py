@@ -17,6 +17,7 @@ def turning_takes(num=5, turn=1.5, seed=3, goal=(0.0, 0.0, 0.0)):
         path = goal + u[:, None] * start + 0.1 * np.sin(np.pi * u)[:, None] * np.array([0.0, 1.0, 0.5])
         axis = np.array([0.3, 1.0, 0.2]) + 0.1 * rng.normal(size=3)
         vectors = turn * (u**1.3)[:, None] * axis / np.linalg.norm(axis) + 0.1 * np.sin(3 * u)[:, None] * [0, 0, 1]
+        vectors += 0.03 * (1 - u[:, None]) ** 2 * rng.normal(size=3)  # each ends turned a little beside the others
         takes.append(Demonstration(np.linspace(0, 4, 150), path, f"{k}", exponential(GOAL, vectors)))
     return tuple(takes)
 

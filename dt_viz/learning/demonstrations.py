@@ -66,7 +66,8 @@ class Demonstration:
     def __repr__(self) -> str:
         shape = "×".join(map(str, np.shape(self.positions)))
         duration = f", {self.times[-1] - self.times[0]:.3g} s" if np.size(self.times) > 1 else ""
-        return f"Demonstration({self.name!r}: {shape} positions, metres{duration})"
+        turns = "" if self.orientations is None else " with orientations"
+        return f"Demonstration({self.name!r}: {shape} positions{turns}, metres{duration})"
 
 
 class DemonstrationError(DataError):

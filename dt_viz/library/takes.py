@@ -161,8 +161,7 @@ def _way_out(array: Array) -> str:
     if array.ndim in (2, 3) and array.shape[-1] == 4:
         return "; if the first column is time: dt.Demonstration(a[:, 0], a[:, 1:])"
     if array.ndim in (2, 3) and array.shape[-1] in (5, 6, 7):
-        poses = "dt.Demonstration(times, a[:, :3], orientations=a[:, 3:]), quaternions wxyz"
-        return f"; of joint angles: positions = arm.end_effector(q), of poses: {poses}"
+        return "; of joint angles: positions = arm.end_effector(q), of poses: a[:, :3], orientations=a[:, 3:]"
     return ""
 
 

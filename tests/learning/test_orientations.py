@@ -86,6 +86,14 @@ class TestSystem:
         assert apart(goal, imitation.goal_orientation).max() < 1e-3
         np.testing.assert_allclose(end[:, :3], imitation.goal[None].repeat(20, 0), atol=1e-3)
 
+    def test_in_a_world_that_is_turned_and_scaled_it_is_turned(self, imitation):
+        world = Rotation.from_rotvec([0.3, 0.8, -0.5])
+        placed = imitation.placed(np.array([0.1, 0.2, 0.3]), world.as_matrix(), 0.7)
+        places = np.array([0.1, 0.2, 0.3]) + 0.7 * world.apply(imitation.starts)
+        one, other = imitation.states(imitation.starts)[:, 3:], placed.states(places)[:, 3:]
+        turned = quaternions(world * rotation(imitation.poses.predicted(one)))
+        assert apart(placed.poses.predicted(other), turned).max() < 1e-7
+
     def test_velocities_are_the_derivatives_of_motions(self, imitation):
         system, state, h = imitation.poses.system, states(imitation, 6), 1e-5
         slope = (system.rollout(state, np.array([h]))[:, 0] - state) / h
