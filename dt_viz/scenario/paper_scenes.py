@@ -118,7 +118,7 @@ def _sphere_in_the_letter(diameter: float) -> Callable[[Task], Scenario]:
 def _cube_before_the_attractor(task: Task) -> Scenario:
     """Fig. 3 (a): motions that are straight but for a cube of 10 cm."""
     middle = (task.starts.mean(axis=0) + task.mean_path[-1]) / 2
-    cube = Box(as_point(middle), (0.10 * task.size,) * 3)
+    cube = Box(as_point(middle), (side := 0.10 * task.size, side, side))
     return replace(_avoiding(task, Avoidance(cube, plane=plane_of(task))), imitation=False)
 
 
