@@ -206,6 +206,13 @@ class TestRelocation:
         cloud = SCENES["cloud"].scenario(TASKS["draw_s"]()).obstacles[0]
         assert replace(cast(Any, to.obstacle(cloud)), position=cloud.position) == cloud
 
+    def test_an_obstacle_that_nobody_has_moved_is_where_the_task_has_it(self):
+        before = TASKS["drop_pots"]()
+        after = replace(before.placed(0.5, (0.1, 0.0, 0.0)), obstacle_position=(0.2, -0.4, 0.3))
+        to = Relocation.between(before, after)
+        assert to.obstacle(Sphere(before.obstacle_position)).position == after.obstacle_position
+        assert to.obstacle(Sphere((0.0, -0.5, 0.4))).position == (0.1, -0.25, 0.2)
+
     def test_the_slice_and_the_followed_rollout_go_along(self):
         before, after = TASKS["draw_s"](), smaller("draw_s")()
         view = replace(Scenario("draw_s").view, slice=SlicePose((0.2, -0.4, 0.4), (1.0, 0.0, 0.0, 0.0)))
