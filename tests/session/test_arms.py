@@ -189,6 +189,12 @@ class TestChoosing:
         session.choose_arm("")
         assert session.scenario.scene == "others_push"
 
+    def test_what_is_learned_and_passed_belongs_to_an_arm(self):
+        one = Scenario("draw_s")
+        other = replace(one, arm="panda")
+        assert (one.fit, one.learned, one.full) != (other.fit, other.learned, other.full)
+        assert one.fit != other.fit and one.learned != other.learned and not one.begins_like(other)
+
     def test_the_engine_in_use_is_kept_and_no_more_than_one_beside_it(self, robot):
         made = []
         engines = Engines(cast(Engine, "first"), lambda name, _progress: cast(Engine, made.append(name) or name))
