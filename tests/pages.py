@@ -132,11 +132,14 @@ def panel_of(server: viser.ViserServer, notify: Any = ignored) -> ControlPanel:
 class NoFrames:
     """An engine that has no frames: nothing here is about motions."""
 
-    bring = Engine.bring
+    bring, adopt = Engine.bring, Engine.adopt
 
-    def __init__(self):
-        self.follower = Follower(load_jaco())
+    def __init__(self, robot=None):
+        self.follower = Follower(robot or load_jaco())
         self.arm, self.own, self._last = LiveArm(self.follower), {}, {}
+
+    def title(self, name):
+        return TASKS[name].title
 
     def see(self, _scenario):
         pass
@@ -151,7 +154,7 @@ class NoFrames:
 class Page:
     """A visitor's page on a server that nobody looks at, and what a browser may send to it."""
 
-    def __init__(self, server: viser.ViserServer, robot: Any) -> None:
+    def __init__(self, server: viser.ViserServer, robot: Any, arms: Any = None) -> None:
         self.gui, self.scene = server.gui, server.scene
         self.camera = CameraClient().camera
         self.client = SimpleNamespace(
@@ -167,7 +170,7 @@ class Page:
         )
         self.gui._resolve_client = lambda _id: self.client  # type: ignore[method-assign]
         self.scene._get_client_handle = lambda _id: self.client  # type: ignore[method-assign]
-        self.visitor = Visitor(cast(Any, self.client), cast(Engine, NoFrames()), robot, TITLES, "draw_s")
+        self.visitor = Visitor(cast(Any, self.client), cast(Engine, NoFrames()), robot, TITLES, "draw_s", arms)
         self._loop = asyncio.new_event_loop()
         self.session = self.visitor.session
         self._initial = self.session.scenario

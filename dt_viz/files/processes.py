@@ -10,7 +10,7 @@ from typing import IO, Any
 
 
 def start_module(
-    name: str, *arguments: str, output: int | IO[Any], given: int = subprocess.DEVNULL
+    name: str, *arguments: str, output: int | IO[Any], given: int = subprocess.DEVNULL, temporary: str | None = None
 ) -> subprocess.Popen:
     """Start a module of this package as a process, with one thread for linear algebra.
 
@@ -19,6 +19,7 @@ def start_module(
         arguments: of its command line.
         output: file or pipe of its standard output.
         given: that of its standard input.
+        temporary: folder of its temporary files; None is the usual one.
     """
     root = Path(__file__).parents[2]  # holds this package
     path = os.pathsep.join([str(root), *filter(None, sys.path)])
@@ -26,7 +27,7 @@ def start_module(
     return subprocess.Popen(
         [sys.executable, "-m", name, *arguments],
         cwd=root,  # where -m looks first
-        env=os.environ | threads | {"PYTHONPATH": path},
+        env=os.environ | threads | {"PYTHONPATH": path} | ({"TMPDIR": temporary} if temporary else {}),
         stdin=given,
         stdout=output,
         stderr=subprocess.DEVNULL,

@@ -5,13 +5,11 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-import sys
 import tempfile
 import threading
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -19,6 +17,7 @@ import numpy as np
 
 from dt_viz.errors import Cancelled, FormatError, end_if, never
 from dt_viz.files import worker
+from dt_viz.files.processes import start_module
 
 Read = tuple[list[np.ndarray], tuple[str, ...]]
 """Arrays of a file, and notes about it for the page."""
@@ -32,18 +31,10 @@ class _Process:
     """A process of `dt_viz.files.worker`, which may read one file."""
 
     def __init__(self) -> None:
-        root = Path(__file__).parents[2]  # holds this package
-        path = os.pathsep.join([str(root), *filter(None, sys.path)])
-        threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
         self._folder = tempfile.TemporaryDirectory(prefix="dt-viz-")  # what a process leaves that is ended goes with it
         self._answer = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `end`; a pipe could be filled without end
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", worker.__name__],
-            cwd=root,  # where -m looks first
-            env=os.environ | threads | {"PYTHONPATH": path, "TMPDIR": self._folder.name},
-            stdin=subprocess.PIPE,
-            stdout=self._answer,
-            stderr=subprocess.DEVNULL,
+        self._process = start_module(
+            worker.__name__, output=self._answer, given=subprocess.PIPE, temporary=self._folder.name
         )
 
     @property

@@ -26,12 +26,15 @@ class Relocation:
     scale: float
     shift: Point
     """Metres."""
+    first: tuple[Point, Point] | None = None
+    """Where the task's first obstacle was and is now, metres: one that nobody has moved stays that."""
 
     @classmethod
     def between(cls, before: Task, after: Task) -> Relocation:
         """Return the map of the same task's world at two places; they differ in place and scale only."""
         scale = after.scale / before.scale
-        return cls(scale, as_point(after.origin - scale * before.origin))
+        shift = as_point(after.origin - scale * before.origin)
+        return cls(scale, shift, (before.obstacle_position, after.obstacle_position))
 
     def point(self, place: Point) -> Point:
         """Map a place, metres."""
@@ -39,7 +42,10 @@ class Relocation:
 
     def obstacle(self, obstacle: Obstacle) -> Obstacle:
         """Map an obstacle. What comes from a file keeps its size, others theirs within the limits of the page."""
-        moved = obstacle.moved(self.point(obstacle.position), obstacle.wxyz)
+        place = self.point(obstacle.position)
+        if self.first is not None and obstacle.position == self.first[0]:
+            place = self.first[1]
+        moved = obstacle.moved(place, obstacle.wxyz)
         if not isinstance(moved, Sphere | Box | Cylinder):
             return moved
         names = [name for name in ("diameter", "height", "sizes") if hasattr(moved, name)]

@@ -125,11 +125,8 @@ class Engine:
             UnwantedError: it is cancelled.
         """
         self.nominal(scenario, progress)
-        others = {
-            shown: Scenario(panel.task, state=panel.state, arm=scenario.arm)
-            for panel in scenario.view.panels
-            if (shown := panel.shown) is not None
-        }
+        shown = [panel.shown for panel in scenario.view.panels if panel.shown]
+        others = {panel: Scenario(panel.task, state=panel.state, arm=scenario.arm) for panel in shown}
         learned = {panel: self.nominal(other, progress).learned for panel, other in others.items()}
         with _cores.slot():
             frame = self._rollouts(scenario, LIVE)

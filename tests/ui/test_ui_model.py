@@ -1,0 +1,113 @@
+"""Arm → Model on a page that nobody looks at: what is drawn and offered is the chosen arm's."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from other_arms import seven_joints
+from pages import NoFrames, Page
+
+from dt_viz.robot.placement import is_jaco
+from dt_viz.robot.urdf import ArmError
+from dt_viz.scenario.paper_scenes import SCENES
+from dt_viz.session.session import CHOICES
+
+TITLES = {"": "JACO", "panda": "Franka Panda", "broken": "Broken"}
+OF_JACO = {scene.title for scene in SCENES.values() if scene.of_jaco}
+
+
+def new_engine(name, _progress):
+    if name == "broken":
+        raise ArmError("broken.urdf", "mesh", "nothing", "a file")
+    return NoFrames(taller())
+
+
+def taller():
+    arm = seven_joints()
+    shifts = arm.joint_translations.copy()
+    shifts[0] += (0.0, 0.0, 0.05)
+    return replace(arm, joint_translations=shifts)
+
+
+@pytest.fixture
+def page(server, robot):
+    page = Page(server, robot, cast(Any, SimpleNamespace(titles=TITLES, engine=new_engine)))
+    yield page
+    page.close()
+    server.gui.reset()
+    server.scene.reset()
+
+
+def choose(page, title):
+    page.claim(page["Model"], title)
+    assert page.session.jobs.wait_idle(CHOICES, 30)
+
+
+def num_joints(page):
+    return max(name.count("joint_") for name in page.nodes if name.startswith("/arm/"))
+
+
+def test_it_is_a_step_of_the_session_and_shown(page):
+    assert page["Model"].options == tuple(TITLES.values()) and page["Model"].value == "JACO"
+    choose(page, "Franka Panda")
+    assert page.session.scenario.arm == "panda" and page["Model"].value == "Franka Panda"
+    page.session.undo()
+    assert page.session.scenario.arm == "" and page["Model"].value == "JACO"
+
+
+def test_nothing_else_than_what_is_offered_is_taken(page):
+    for forged in ("panda", "/etc/passwd", "", None, 3, ["JACO"], "x" * 10_000):
+        page.claim(page["Model"], forged)
+    assert page.session.jobs.wait_idle(CHOICES, 30)
+    assert page.session.scenario.arm == "" and page["Model"].value == "JACO"
+
+
+def test_one_that_cannot_be_loaded_leaves_the_old_one_on_the_page(page):
+    choose(page, "Broken")
+    assert page.session.scenario.arm == "" and page["Model"].value == "JACO"
+    said = page.session._screen.progress.message
+    assert said is not None and said.text == "broken.urdf: mesh: found nothing; accepted: a file"
+
+
+def test_joints_scenes_plots_and_the_loop_are_those_of_the_arm(page):
+    visitor, scenes = page.visitor, page["Scene"].options
+    assert num_joints(page) == 6 and set(scenes) >= OF_JACO
+    live, onion = visitor.robot.playback.live, visitor.pictures.layer("onion")
+    choose(page, "Franka Panda")
+    visitor._exchange("panda")
+    robot = page.session.robot
+    assert robot.num_joints == 7 and not is_jaco(robot)
+    assert num_joints(page) == 7 and visitor.robot.playback.live is page.session.engine.arm is not live
+    assert visitor.pictures.layer("onion") is not onion
+    assert not OF_JACO & set(page["Scene"].options) and set(page["Scene"].options) < set(scenes)
+    plots = visitor._panel.show.joints
+    assert len(plots.speeds.series) == len(plots.speeds.data) == 1 + 7 + 1
+    assert visitor._camera.framing.arm_size == robot.size
+    visitor.robot.arms.pose(robot.home, robot.home)
+    visitor.adopt(page.session.scenario)
+    choose(page, "JACO")
+    visitor._exchange("")
+    assert num_joints(page) == 6 and visitor.robot.playback.live is live
+    assert page["Scene"].options == scenes and len(plots.speeds.series) == 8
+
+
+def test_a_scene_of_the_jaco_says_so_with_another_arm(page):
+    choose(page, "Franka Panda")
+    page.visitor._exchange("panda")
+    title = next(title for title in page.commands if title in OF_JACO)
+    page.give(page.commands[title])
+    assert page.session.jobs.wait_idle(CHOICES, 30)
+    said = page.session._screen.progress.message
+    assert said is not None and said.text == f"“{title}” is made for the JACO: choose it in Arm → Model."
+    assert page.session.scenario.scene == ""
+
+
+def test_push_reaches_the_arm_that_is_drawn(page):
+    pushed = []
+    choose(page, "Franka Panda")
+    page.session.engine.arm.push = lambda: pushed.append("panda")
+    page["Push the hand"].disabled = False
+    page.claim(page["Push the hand"], True)
+    assert pushed == ["panda"] and np.array_equal(page.session.robot.home, taller().home)
