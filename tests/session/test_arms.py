@@ -46,12 +46,14 @@ class Sketch:
 class Sketches:
     """An engine whose frames are empty."""
 
+    bring, adopt = Engine.bring, Engine.adopt
+
     def __init__(self, robot, tasks=TASKS):
         self.follower, self.tasks, self.seen = Follower(robot), tasks, []
-        self.arm = LiveArm(self.follower)
+        self.arm, self.own, self._last = LiveArm(self.follower), {}, {}
 
     def task(self, name):
-        return self.tasks[name]()
+        return self.own[name][0] if name in self.own else self.tasks[name]()
 
     def title(self, name):
         return self.tasks[name].title
@@ -196,11 +198,25 @@ class TestChoosing:
         assert one.fit != other.fit and one.learned != other.learned and not one.begins_like(other)
 
     def test_the_engine_in_use_is_kept_and_no_more_than_one_beside_it(self, robot):
-        made = []
-        engines = Engines(cast(Engine, "first"), lambda name, _progress: cast(Engine, made.append(name) or name))
-        assert [engines(name) for name in ("", "a", "", "b", "", "b")] == ["first", "a", "first", "b", "first", "b"]
-        assert made == ["a", "b"] and engines.get("a") is None
-        assert engines("a") == "a" and engines.get("") is None and engines.get("b") == "b"
+        made = {"first": cast(Engine, Sketches(robot))}
+        engines = Engines(made["first"], lambda name, _: made.setdefault(name, cast(Engine, Sketches(robot))))
+        for name in ("", "a", "", "b", "", "b"):
+            assert engines(name) is made[name or "first"]
+        assert made.keys() == {"first", "a", "b"} and engines.get("a") is None
+        assert engines("a") is made["a"] and engines.get("") is None and engines.get("b") is made["b"]
+
+    def test_own_tasks_are_those_of_every_arm_also_of_one_that_is_chosen_later(self, opened):
+        session, _, engines, _ = opened
+        session.choose_arm("small")
+        own, gone = session.bring(TASKS["draw_c"]())
+        assert gone is None and session.engine.task(own.name) is own
+        session.choose_task(own.name)
+        session.choose_arm("")
+        assert session.scenario.task == own.name and session.task is own
+        for _ in range(4):
+            last, gone = session.bring(TASKS["draw_c"]())
+        assert gone is not None and own.name in session.engine.own  # it is shown
+        assert gone not in engines["small"].own and last.name in engines["small"].own
 
 
 class TestRelocation:
