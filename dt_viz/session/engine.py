@@ -76,7 +76,7 @@ class Engine:
 
     def title(self, name: str) -> str:
         """Title of the task of that name."""
-        return self._tasks[name].title
+        return self.own[name][0].title if name in self.own else self._tasks[name].title
 
     def task(self, name: str) -> Task:
         """The task of that name, which all engines share but for a visitor's own; any thread may ask for it.

@@ -213,8 +213,7 @@ class TestChoosing:
         session.choose_task(own.name)
         session.choose_arm("")
         assert session.scenario.task == own.name and session.task is own
-        for _ in range(4):
-            last, gone = session.bring(TASKS["draw_c"]())
+        (*_, (last, gone)) = [session.bring(TASKS["draw_c"]()) for _ in range(4)]
         assert gone is not None and own.name in session.engine.own  # it is shown
         assert gone not in engines["small"].own and last.name in engines["small"].own
 
