@@ -386,6 +386,7 @@ def read_what_is_given() -> None:
             read(kind, name, content)
         except DataError as error:
             message = str(error)
+        faulthandler.cancel_dump_traceback_later()  # waiting for the next file is no reading
         worker = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
         print(json.dumps([message, seconds() - start, megabytes("VmHWM") - before, worker]), flush=True)
 

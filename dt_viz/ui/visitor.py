@@ -77,8 +77,6 @@ class Visitor(Display):
             self.pictures = ScenePictures(client.scene, robot, lambda: self.session)
             self.robot = RobotScene(client, robot, Playback(engine.arm, self._pose))
         self._exchanging = threading.RLock()  # the arm is moved, and shown or hidden, by other threads
-        self._arm = ""
-        """Name of the arm that is drawn."""
         titled = {"": robot.title} if arms is None else arms.titles
         self._camera = CameraController(client, lambda: self.robot.hand, robot.size)
         self._panel = ControlPanel(
@@ -109,7 +107,7 @@ class Visitor(Display):
 
     def draw(self, frame: Frame, pace: Pace) -> None:
         beside = tuple(panel.shown for panel in frame.pictures.panels)
-        if frame.scenario.arm != self._arm:
+        if frame.scenario.arm != (self.shown.scenario.arm if self.shown else ""):
             self._exchange(frame.scenario.arm)
         others = frame.stage is not Stage.ROLLOUTS and len(beside) != len(self._camera.panels)
         if self.shown is None or frame.task is not self.shown.task or others:
@@ -167,7 +165,7 @@ class Visitor(Display):
         robot = engine.follower.robot
         with self.client.atomic(), self._exchanging:
             self.robot.remove()
-            self._arm, self.robot = name, RobotScene(self.client, robot, Playback(engine.arm, self._pose))
+            self.robot = RobotScene(self.client, robot, Playback(engine.arm, self._pose))
             self.pictures.take(self.client.scene, robot)
             self.robot.paint(self._theme)
             self.robot.adopt(self.session.scenario.view, self.pictures.look)

@@ -163,7 +163,7 @@ def test_a_constant_gap_that_covers_take_for_contact_may_be_one(robot, gap, told
 def test_courses_of_an_arm_whose_postures_are_not_unique_end_where_its_motions_do():
     robot = load_arm("xarm7")
     engine = Engine(in_reach(TASKS, robot), FitStore(default_cache_folder()), robot)
-    follower, solved = engine.follower, engine.solved(Scenario("drop_pots"), LIVE)
+    follower, solved = engine.follower, engine.solved(Scenario("push_box"), LIVE)
     known, goal = follower.reference_postures(solved.nominal.learned), solved.nominal.goal
     straight = [track(robot, goal[None], posture, reference=posture).q[0] for posture in known.references]
     far = int(np.abs(straight - known.on_path[:, -1]).max(axis=1).argmax())
