@@ -153,13 +153,13 @@ def _escapes(
     velocities: Array,
     before: Sequence[Array | None],
     num: int,
-) -> list[Array | None]:
-    """The best `num` escape directions (num, 3) from each obstacle at most; None where no posture comes too near it."""
+) -> list[list[Array] | None]:
+    """At most `num` escape directions (3,) from each obstacle, the best first; None where no posture is too near it."""
     chain = arm.robot.chain(q.T)
     points, tangents = arm.body.of_chain(chain), np.gradient(chain.position.T, axis=0) if len(q) > 1 else 0 * q[:, :3]
     tangents = tangents / np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
     beside = max(arm.settings.beside, avoidance.margin)  # that of what is fast may be wider
-    found: list[Array | None] = []
+    found: list[list[Array] | None] = []
     for part, velocity, way in zip(avoidance.avoided.parts, velocities, before, strict=True):
         clearance = arm.clearance(q, part, beside)
         near, bent = np.flatnonzero(clearance < avoidance.margin), np.flatnonzero(clearance < beside)
