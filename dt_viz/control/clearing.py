@@ -7,6 +7,7 @@ once. No posture is pinned: a robot at rest gives way, too, and where nothing co
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,12 +21,13 @@ from dt_viz.avoidance.detour import escape_directions, turned
 from dt_viz.flows.diffeomorphisms import Conjugated, Diffeomorphism, Flow, Identity
 from dt_viz.flows.fields import Array
 from dt_viz.kernels.blocks import room_asked
-from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.robot.sizing import sized
 
 NUM_COMPARED = 16
 """Number of colliding postures that escape directions are compared by, about; half of it where an obstacle moves, for
 each is then compared with several places of the obstacle."""
+NUM_TRIED = 8
+"""Largest number of escape directions that are tried from obstacles at rest where the best one leads into them."""
 STEP = 0.05
 """Flow time between two looks at the clearance."""
 COARSE_STEP = 0.2
@@ -79,15 +81,58 @@ def clearing(
         return Clearing()
     q, parts = arm.limits.inside(q), avoidance.avoided.parts
     known = before.directions if len(before.directions) == len(parts) else (None,) * len(parts)
-    chain = arm.robot.chain(q.T)
-    points, tangents = arm.body.of_chain(chain), np.gradient(chain.position.T, axis=0) if len(q) > 1 else 0 * q[:, :3]
-    tangents = tangents / np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
-    beside = max(arm.settings.beside, avoidance.margin)  # that of what is fast may be wider
-    directions = tuple(
-        _direction(arm, points, arm.clearance(q, part, beside), tangents, part, velocity, avoidance, way, turn)
-        for part, velocity, way in zip(parts, velocities, known, strict=True)
-    )
-    met = [(part, way) for part, way in zip(parts, directions, strict=True) if way is not None]
+    chosen = [
+        None if escapes is None else escapes[0] if way is None else turned(way, escapes[0], turn, escapes)
+        for escapes, way in zip(_escapes(arm, q, avoidance, velocities, known, 1), known, strict=True)
+    ]
+    return _by(arm, q, avoidance, end, [way if one is None else one for one, way in zip(chosen, known, strict=True)])
+
+
+def checked(
+    arm: WholeArm, found: Clearing, q: Array, avoidance: ArmAvoidance | None, before: Clearing, end: Array, near: float
+) -> Clearing:
+    """The same way around obstacles at rest, or another one where it leads into an obstacle.
+
+    A posture that is clear by itself may be carried into an obstacle, on whose other side it is: then other escape
+    directions are tried, that before first. Where none leads around, what was found is left as it is.
+
+    Args:
+        arm: see `clearing`.
+        found: what was found.
+        q: (N, n) postures of the undisturbed motion, rad.
+        avoidance: see `clearing`.
+        before: see `clearing`.
+        end: see `clearing`.
+        near: clearance that postures must have at least, metres, or beside `end` what that lacks of the margin more.
+    """
+    if avoidance is None or found.field is None:
+        return found
+    q = arm.limits.inside(q)
+
+    def leads_around(way: Clearing) -> bool:
+        p = way.transform(arm, way.duration).inverse(q)
+        return bool((lack(arm, p, avoidance, end, avoidance.margin) <= avoidance.margin - near).all())
+
+    if leads_around(found):
+        return found
+    known = before.directions if len(before.directions) == len(found.directions) else (None,) * len(found.directions)
+    escapes = _escapes(arm, q, avoidance, np.zeros((len(known), 3)), (None,) * len(known), NUM_TRIED)
+    tried = [
+        [way] * NUM_TRIED if others is None else [*([] if old is None else [old]), *others, *[others[-1]] * NUM_TRIED]
+        for way, old, others in zip(found.directions, known, escapes, strict=True)
+    ]
+    for ways in list(zip(*tried, strict=False))[:NUM_TRIED]:
+        other = _by(arm, q, avoidance, end, ways)
+        if other.cleared and leads_around(other):
+            return other
+    return found
+
+
+def _by(
+    arm: WholeArm, q: Array, avoidance: ArmAvoidance, end: Array | None, directions: Sequence[Array | None]
+) -> Clearing:
+    """The way around obstacles in given directions; see `clearing`."""
+    met = [(part, way) for part, way in zip(avoidance.avoided.parts, directions, strict=True) if way is not None]
     if not met:
         return Clearing()
     obstacles, ways = zip(*met, strict=True)
@@ -98,42 +143,44 @@ def clearing(
     def lacking(p: Array, most: float) -> Array:
         return lack(arm, p, avoidance, end, most)
 
-    return Clearing(field, directions, clearing_time(field, arm.limits, q, lacking, STEP, MAX_DURATION))
+    return Clearing(field, tuple(directions), clearing_time(field, arm.limits, q, lacking, STEP, MAX_DURATION))
 
 
-def _direction(
+def _escapes(
     arm: WholeArm,
-    points: Array,
-    clearance: Array,
-    tangents: Array,
-    part: Obstacle,
-    velocity: Array,
+    q: Array,
     avoidance: ArmAvoidance,
-    before: Array | None,
-    turn: float,
-) -> Array | None:
-    """Choose the escape direction (3,) from one obstacle; that before where no posture comes too near it.
-
-    Points (P, 3, N) and clearance (N,), up to what is beside the obstacle, are those of the same postures.
-    """
-    near = np.flatnonzero(clearance < avoidance.margin)
-    if not len(near):
-        return before
-    bent = np.flatnonzero(clearance < max(arm.settings.beside, avoidance.margin))
-    num = NUM_COMPARED // 2 if velocity.any() else NUM_COMPARED
-    compared = points[:, :, near[:: max(1, len(near) // num)]]
-    escapes = escape_directions(
-        compared,
-        arm.body.radius,
-        tangents[bent],
-        part,
-        avoidance.margin,
-        num=1,
-        velocity=velocity,
-        previous=before,
-        settings=sized(avoidance.detour, arm.robot.size),
-    )
-    return escapes[0] if before is None else turned(before, escapes[0], turn, escapes)
+    velocities: Array,
+    before: Sequence[Array | None],
+    num: int,
+) -> list[list[Array] | None]:
+    """At most `num` escape directions (3,) from each obstacle, the best first; None where no posture is too near it."""
+    chain = arm.robot.chain(q.T)
+    points, tangents = arm.body.of_chain(chain), np.gradient(chain.position.T, axis=0) if len(q) > 1 else 0 * q[:, :3]
+    tangents = tangents / np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
+    beside = max(arm.settings.beside, avoidance.margin)  # that of what is fast may be wider
+    found: list[list[Array] | None] = []
+    for part, velocity, way in zip(avoidance.avoided.parts, velocities, before, strict=True):
+        clearance = arm.clearance(q, part, beside)
+        near, bent = np.flatnonzero(clearance < avoidance.margin), np.flatnonzero(clearance < beside)
+        if not len(near):
+            found.append(None)
+            continue
+        compared = NUM_COMPARED // 2 if velocity.any() else NUM_COMPARED
+        found.append(
+            escape_directions(
+                points[:, :, near[:: max(1, len(near) // compared)]],
+                arm.body.radius,
+                tangents[bent],
+                part,
+                avoidance.margin,
+                num=num,
+                velocity=velocity,
+                previous=way,
+                settings=sized(avoidance.detour, arm.robot.size),
+            )
+        )
+    return found
 
 
 def lack(arm: WholeArm, p: Array, avoidance: ArmAvoidance, end: Array | None, most: float) -> Array:

@@ -47,6 +47,12 @@ class Course:
         """Postures (K', n) from a time on, up to the end."""
         return np.concatenate([self.at(clock)[None], self.q[self.times > clock]])
 
+    def between(self, clock: float, num: int) -> Array:
+        """Postures (K', n) from a time on: `num` for each of its own samples."""
+        samples = np.arange(len(self.times))
+        times = np.interp(np.linspace(0, samples[-1], num * samples[-1] + 1), samples, self.times)
+        return np.stack([self.at(time) for time in (clock, *times[times > clock])])
+
     def image(self, clock: float) -> Array:
         """Base coordinates (k,) at a time."""
         return np.array([np.interp(clock, self.times, z) for z in self.z.T])

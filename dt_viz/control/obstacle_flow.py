@@ -6,7 +6,7 @@ import numpy as np
 
 from dt_viz.avoidance.arm import WholeArm
 from dt_viz.avoidance.avoidance import ArmAvoidance
-from dt_viz.control.clearing import Clearing, clearing
+from dt_viz.control.clearing import Clearing, checked, clearing
 from dt_viz.control.courses import Course, Progress
 from dt_viz.control.obstacle_motion import NOTHING_SEEN
 from dt_viz.control.settings import ControllerSettings
@@ -90,5 +90,9 @@ class ObstacleFlow:
         else:
             avoidance, ahead = seen.avoidance, progress.ahead
             ahead, end = ahead[:: max(1, len(ahead) // settings.num_clear)], self._arm.limits.inside(ahead[-1])
-        self._clearing = clearing(self._arm, ahead, avoidance, seen.velocities, self._clearing, turn, end)
+        found = clearing(self._arm, ahead, avoidance, seen.velocities, self._clearing, turn, end)
+        if end is not None and avoidance is not None:
+            near, q = min(settings.clearance, avoidance.margin / 2), course.between(clock, settings.num_between)
+            found = checked(self._arm, found, q, avoidance, self._clearing, end, near)
+        self._clearing = found
         self._made, self.changed = self.time, False

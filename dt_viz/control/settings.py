@@ -86,6 +86,8 @@ class ControllerSettings:
     """Distance from the postures of its motion that counts as none, rad."""
     num_clear: int = 40
     """Number of postures ahead that are to be clear of obstacles at rest."""
+    num_between: int = 2
+    """Number of postures for each sample of a course that are then looked at again, to be `clearance` away at least."""
     num_clear_moving: int = 10
     """Number of postures within `window` that are to be clear of obstacles that move."""
     ramp: float = 0.3

@@ -20,7 +20,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -241,14 +241,19 @@ def _drag(engine: Engine, name: str, diameter: float) -> Iterator[float]:
 
 def _row(passages: Sequence[Passage]) -> dict[str, Any]:
     """Row of the table, as far as balls go."""
-    num = len(passages)
+    num, others = len(passages), [passage.has_way for passage in passages if not passage.is_cleared]
     return {
-        "cleared": f"{sum(passage.is_cleared for passage in passages)} of {num}",
-        "least mm": 1e3 * float(np.nanmin([passage.clearance for passage in passages])),
+        "cleared": f"{num - len(others)} of {num}",
+        "others with a way": None if None in others else sum(map(bool, others)),
+        "least mm": _least_mm(passage.clearance for passage in passages),
         "some starts": sum(0 < passage.num_moving < passage.num_starts for passage in passages),
         "no way": sum(passage.num_moving == 0 for passage in passages),
-        "of these a way": sum(passage.has_way or False for passage in passages),
         "drawn again": sum(passage.drawn_again for passage in passages),
         "loop at goal": f"{sum(passage.missed <= SETTINGS.at_goal for passage in passages)} of {num}",
-        "loop least mm": 1e3 * float(np.nanmin([passage.loop for passage in passages])),
+        "loop least mm": _least_mm(passage.loop for passage in passages),
     }
+
+
+def _least_mm(distances: Iterable[float]) -> float:
+    """The least of distances in metres, millimetres, without those that are NaN; NaN if all are."""
+    return 1e3 * min((distance for distance in distances if not np.isnan(distance)), default=np.nan)

@@ -12,6 +12,9 @@ from scipy.spatial.transform import Rotation
 from dt_viz.flows.fields import Array
 from dt_viz.numerics import unit
 
+FULL = 0.02
+"""Angle, rad, from a full turn, or from none, up to which noise decides about the axis: it is the one before."""
+
 
 def rotation(wxyz: Array) -> Rotation:
     """Rotations of unit quaternions (N, 4) or (4,), wxyz."""
@@ -35,11 +38,13 @@ def logarithm(origin: Array, wxyz: Array) -> Array:
     quaternions make no difference.
     """
     vectors = (rotation(origin).inv() * rotation(wxyz)).as_rotvec()[::-1]  # from the end
-    axes = unit(vectors)
+    with_axis = np.where(np.linalg.norm(vectors, axis=1) < FULL, 0, np.arange(len(vectors)))
+    axes = unit(vectors)[np.maximum.accumulate(with_axis)]
     turned = np.where((axes[1:] * axes[:-1]).sum(axis=1) < 0, -1.0, 1.0)
     sides = np.cumprod(np.concatenate([[1.0], turned]))
-    angles = np.unwrap(sides * np.linalg.norm(vectors, axis=1))
-    return ((sides * angles)[:, None] * axes)[::-1]
+    short = sides * (vectors * axes).sum(axis=1)
+    turns = 2 * np.pi * np.round((np.unwrap(short) - short) / (2 * np.pi))
+    return (vectors + (sides * turns)[:, None] * axes)[::-1]
 
 
 def exponential(origin: Array, vectors: Array) -> Array:
@@ -61,7 +66,7 @@ def turning(first: Array, second: Array) -> Array:
 def nearest(origin: Array, wxyz: Array, near: Array) -> Array:
     """The rotation vector (3,), rad, of an orientation (4,) at an origin (4,) which is nearest to another one (3,)."""
     short = (rotation(origin).inv() * rotation(wxyz)).as_rotvec()
-    axis = unit(short if short.any() else near)
+    axis = unit(near if np.linalg.norm(short) < FULL else short)
     turns = np.round((near - short) @ axis / (2 * np.pi))
     return short + 2 * np.pi * turns * axis
 

@@ -23,7 +23,8 @@ from dt_viz.warning import in_millimetres
 
 FindingKind = Literal["units", "outliers", "gap", "jitter", "pause", "still", "elsewhere", "end", "start", "turn"]
 """Kind of a finding: another unit, single samples far off, a time without samples, trembling, standing still, never
-moving, an end that is not the others' goal, one beside it, a start at the goal, and more than half a turn."""
+moving, an end that is not the others' goal, one beside it, a start at the goal, and more than half a turn, or an end
+turned away from the others."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,9 @@ class PreparationSettings:
     """Distance from the goal up to which an end is at the goal."""
     max_moved_end: float = 0.3
     """Distance from the goal up to which an end is moved there; farther ones are left out."""
+    max_turned_end: float = 0.6
+    """Angle, rad, from the goal's orientation up to which the hand at an end is turned there without a word, and counts
+    in the mean that this is."""
     at_goal: float = 0.05
     """Distance from the goal up to which a start is at the goal."""
     standing_step: float = 1e-3

@@ -60,7 +60,11 @@ class AugmentedSettings:
     """Number of independent deviations that a demonstration counts for when predictors are weighted: more than its
     coordinates, fewer than its knots, whose deviations are alike."""
     time_noise: float = 1.0
-    """Variance of clocks and of the hand's turns that the starts do not explain, relative to what they do."""
+    """Variance of clocks that the starts do not explain, relative to what they do; of the hand's turns where there are
+    too few demonstrations to leave one out."""
+    turn_noises: tuple[float, ...] = (0.2, 0.4, 1.0, 2.5, 6.0)
+    """That of the hand's turns: their geometric mean is taken, weighted by how likely turns that are left out make
+    them."""
     time_width: float = 0.1
     """Width of a kernel of that variance, in spreads, so that a demonstration's own start has its own timing and
     turns."""
@@ -263,19 +267,52 @@ def learn_patterns(
     for index in range(int(of.max()) + 1):
         own = of == index
         usual, turn = timing[own].mean(axis=0), turns[own].mean(axis=0)
-        own_process = settings.width, settings.time_noise, settings.time_width, settings.time_jitter
+        local = settings.time_width, settings.time_jitter
+        turn_noise = _turn_noise(starts[own], turns[own], spread, motions.extent, settings)
         patterns.append(
             Pattern(
                 None if labels is None else labels[index],
                 *_predictor(points[own], spread, settings.knot_error * motions.extent, settings),
                 usual[1:],
                 float(usual[0]),
-                StartProcess.of(starts[own], timing[own] - usual, spread, *own_process),
+                StartProcess.of(starts[own], timing[own] - usual, spread, settings.width, settings.time_noise, *local),
                 turn if motions.turns else None,
-                StartProcess.of(starts[own], turns[own] - turn, spread, *own_process) if motions.turns else None,
+                StartProcess.of(starts[own], turns[own] - turn, spread, settings.width, turn_noise, *local)
+                if motions.turns
+                else None,
             )
         )
     return tuple(patterns)
+
+
+def _turn_noise(starts: Array, turns: Array, spread: float, extent: float, settings: AugmentedSettings) -> float:
+    """The variance of turns (R, K, 3) that the starts (R, d) do not explain; see `AugmentedSettings.turn_noises`."""
+    if len(starts) < 3 or not turns.size:
+        return settings.time_noise
+    kernel = (process := StartProcess.of(starts, turns, spread, settings.width, 1.0))._kernel(process.known)
+    least, logs = settings.knot_error * extent, []
+    for noise in settings.turn_noises:
+        _, residual = _kriging(kernel + noise * np.eye(len(starts)))
+        logs.append(_log_likelihood(_left_out(residual, np.tensordot(residual, turns, 1)), least, settings))
+    likely = np.exp(np.array(logs) - max(logs))
+    return float(np.exp(np.average(np.log(settings.turn_noises), weights=likely)))
+
+
+def _kriging(kernel: Array) -> tuple[Array, Array]:
+    """Weights (R,) of R values in their unknown mean, and what (R, R) makes coefficients of values."""
+    inverse = np.linalg.inv(kernel)
+    weights = inverse.sum(axis=0) / inverse.sum()
+    return weights, inverse - np.outer(inverse.sum(axis=0), weights)
+
+
+def _left_out(residual: Array, coefficients: Array) -> Array:
+    """RMS distances (R,) of values (K, d) from what the others make of them, by the coefficients (R, K, d) of all."""
+    return np.sqrt((coefficients**2).sum(axis=2).mean(axis=1)) / np.diag(residual)
+
+
+def _log_likelihood(missed: Array, least: float, settings: AugmentedSettings) -> float:
+    """Log likelihood of a predictor that misses values by so much (R,), metres, and by `least` at any rate."""
+    return -settings.evidence * len(missed) * float(np.log(missed.mean() + least))
 
 
 def _predictor(
@@ -302,16 +339,13 @@ def _predictor(
     found, logs = [], []
     for explained in settings.explained:
         gain = explained / settings.noise
-        inverse = np.linalg.inv(gain * process._kernel(process.known) + np.eye(num))
-        weights = inverse.sum(axis=0) / inverse.sum()  # of the demonstrations in the unknown mean
-        residual = inverse - np.outer(inverse.sum(axis=0), weights)
+        weights, residual = _kriging(gain * process._kernel(process.known) + np.eye(num))
         for power in settings.fadings:
             fading = u**power
             left = u + (fading - u) * near[:, None]
             shapes = points - left[:, :, None] * offsets[:, None]
             coefficients = np.tensordot(residual, shapes, 1)
-            errors = np.sqrt((coefficients**2).sum(axis=2).mean(axis=1)) / np.diag(residual)
-            logs.append(-settings.evidence * num * np.log(errors.mean() + least))
+            logs.append(_log_likelihood(_left_out(residual, coefficients), least, settings))
             found.append((np.tensordot(weights, shapes, 1), fading, gain * coefficients))
     likely = np.exp(np.array(logs) - max(logs))
     mean, fading, coefficients = (

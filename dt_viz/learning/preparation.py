@@ -10,7 +10,7 @@ import numpy as np
 
 from dt_viz.errors import FormatError
 from dt_viz.flows.fields import Array, Indices
-from dt_viz.flows.rotations import logarithm, mean_orientation
+from dt_viz.flows.rotations import apart, logarithm, mean_orientation
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.demonstrations import Demonstration, samples_of
 from dt_viz.learning.inspection import Inspection, PreparationSettings, Repaired, repair, smoothed_turns
@@ -177,13 +177,27 @@ def _turns(takes: Sequence[Repaired], settings: PreparationSettings) -> tuple[Ar
     if len(takes[0].positions[0]) < 3 or any(take.demonstration.orientations is None for take in takes):
         return None, ()
     orientations = [take.orientations_at(take.times) for take in takes]
-    goal = mean_orientation(np.stack([turned[-1] for turned in orientations]))
+    goal = _common_orientation(takes, np.stack([turned[-1] for turned in orientations]), settings.max_turned_end)
     pairs = zip(takes, orientations, strict=True)
     turns = tuple(smoothed_turns(take, logarithm(goal, turned), settings) for take, turned in pairs)
     for take, turn in zip(takes, turns, strict=True):
         if (farthest := np.linalg.norm(turn, axis=1).max()) > np.pi:
             take.find("turn", f"turns by {np.rad2deg(farthest):.0f}° away from the orientation at the goal")
     return goal, turns
+
+
+def _common_orientation(takes: Sequence[Repaired], ends: Array, reach: float) -> Array:
+    """The orientation (4,) in which most takes end, those within a reach, rad; of the others (R, 4) it is said."""
+    near = apart(ends, mean_orientation(ends)) <= reach
+    if 2 * near.sum() <= len(ends):
+        around = np.stack([apart(ends, end) <= reach for end in ends])
+        near = around[around.sum(axis=1).argmax()]
+    goal = mean_orientation(ends[near])
+    for take, off in zip(takes, apart(ends, goal), strict=True):
+        if off > reach:
+            text, amount = "ends with the hand turned by {} from the others' goal", f"{np.rad2deg(off):.0f}°"
+            take.find("turn", text, "its end is turned there", amount)
+    return goal
 
 
 def _spread(takes: Sequence[Repaired]) -> float:

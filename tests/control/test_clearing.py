@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dt_viz.avoidance.avoidance import ArmAvoidance
-from dt_viz.control.clearing import Clearing, clearing
+from dt_viz.control.clearing import Clearing, checked, clearing
 from dt_viz.flows.fields import Array
 from dt_viz.obstacles.shapes import Sphere, as_point
 
@@ -53,6 +53,24 @@ def test_all_that_lies_ahead_is_cleared_and_the_end_stays(arm, q):
     assert found.cleared and arm.clearance(q, avoidance.avoided).min() < -0.05
     assert arm.clearance(p, avoidance.avoided).min() == pytest.approx(MARGIN, abs=1.5e-3)
     np.testing.assert_allclose(p[-1], q[-1], atol=1e-9)
+
+
+def test_a_way_that_carries_clear_postures_into_the_obstacle_is_left_for_another_one(arm, q):
+    kept, wrong = 5e-3, 0
+    for offset in ((0, 0, 0), (0, 0, -0.12), (0.1, 0, 0), (0, 0.1, 0.05)):
+        avoidance = around(arm, q[50], offset)
+        for way in (*np.eye(3), *-np.eye(3)):
+            bad, p = made(arm, q, avoidance, chosen(way))
+            found = checked(arm, bad, q, avoidance, chosen(way), q[-1], kept)
+            if not bad.cleared:
+                continue
+            if arm.clearance(p, avoidance.avoided).min() > kept:
+                assert found is bad
+                continue
+            p = found.transform(arm, found.duration).inverse(arm.limits.inside(q))
+            assert found.cleared and arm.clearance(p, avoidance.avoided).min() > kept
+            wrong += 1
+    assert wrong > 2
 
 
 def test_the_transform_is_a_bijection(arm, q):

@@ -117,8 +117,12 @@ def test_what_is_missed_counts_against_an_arm():
     assert cleared.is_cleared and not any(passage.is_cleared for passage in others)
     row = arms._row([cleared, *others, replace(cleared, missed=2e-3, loop=-1e-3, drawn_again=3)])
     assert row["cleared"] == "2 of 5" and row["loop at goal"] == "3 of 5" and row["least mm"] == pytest.approx(8.9)
-    assert (row["some starts"], row["no way"], row["of these a way"], row["drawn again"]) == (1, 1, 1, 3)
+    assert (row["some starts"], row["no way"], row["others with a way"], row["drawn again"]) == (1, 1, None, 3)
     assert row["loop least mm"] == pytest.approx(-1)
+    none = replace(others[-1], has_way=False)  # no motion at all
+    row = arms._row([none, *(replace(other, has_way=True) for other in others)])
+    assert (row["others with a way"], arms._row([cleared])["others with a way"]) == (3, 0)
+    assert np.isnan(arms._row([none])["least mm"]) and arms._row([none])["others with a way"] == 0
 
 
 def test_balls_at_the_goal_the_base_or_around_the_hand_are_told_from_those_that_can_be_passed(

@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 from turning import GOAL, turning_takes
 
 import dt_viz as dt
+from dt_viz.evaluate.held_out import follow
 from dt_viz.flows.rotations import apart, exponential, logarithm, mean_orientation, nearest, quaternions, rotation
 from dt_viz.learning.augmented import fit_augmented
 from dt_viz.learning.demonstrations import Demonstration
@@ -51,6 +52,16 @@ class TestRotations:
         vectors = np.linspace(2 * np.pi * turns, 0, 400)[:, None] * axis
         np.testing.assert_allclose(logarithm(GOAL, exponential(GOAL, vectors)), vectors, atol=1e-7)
         np.testing.assert_allclose(nearest(GOAL, exponential(GOAL, vectors[0]), vectors[1]), vectors[0], atol=1e-7)
+
+    def test_a_hand_that_rests_after_a_full_turn_has_one_axis_whatever_the_noise(self):
+        axis = np.array([0.6, 0.0, 0.8])
+        vectors = np.concatenate([np.full(50, 2 * np.pi), np.linspace(2 * np.pi, 0, 150)])[:, None] * axis
+        turned = exponential(GOAL, vectors)
+        np.testing.assert_allclose(logarithm(GOAL, turned), vectors, atol=1e-7)
+        np.testing.assert_allclose(nearest(GOAL, turned[0], vectors[60]), vectors[0], atol=1e-7)
+        noisy = quaternions(rotation(turned) * Rotation.from_rotvec(2e-3 * RNG.normal(size=(200, 3))))
+        found = logarithm(GOAL, noisy)
+        assert np.abs(np.diff(found, axis=0)).max() < 1 and apart(exponential(GOAL, found), noisy).max() < 0.03
 
     def test_a_turn_of_the_world_leaves_vectors_as_they_are(self):
         world, turned = Rotation.from_rotvec([1.0, -2.0, 0.5]), hand(TAKES[0])
@@ -185,6 +196,28 @@ class TestMotion:
         assert one.orientations is None
 
 
+class TestOthersStarts:
+    """What turns are worth from a start that was not demonstrated."""
+
+    def off(self, explained):
+        """Errors of takes left out, whose turns a start explains or not, by those of the mean of the others."""
+        rng, u = np.random.default_rng(3), np.linspace(0, 1, 120)
+        slope, takes = 3 * rng.normal(size=(3, 3)), []
+        for k in range(8):
+            aside, scattered = 0.04 * rng.normal(size=3), 0.12 * rng.normal(size=3)
+            path = np.outer(1 - u, np.array([0.3, 0.0, 0.2]) + aside) + np.outer(np.sin(np.pi * u), [0.0, 0.1, 0.1])
+            turn = np.outer(1 - u, np.array([0.5, -0.8, 0.3]) + (slope @ aside if explained else scattered))
+            takes.append(Demonstration(4 * u, path, f"{k}", exponential(GOAL, turn)))
+        followed = follow(takes, fit_augmented, len(takes))
+        return np.mean([each.degrees["learned"] for each in followed]) / np.mean(
+            [each.degrees["mean"] for each in followed]
+        )
+
+    def test_they_are_learned_from_starts_where_these_explain_them_and_else_are_the_mean(self):
+        assert self.off(explained=True) < 0.6
+        assert self.off(explained=False) < 1.08
+
+
 class TestPreparation:
     def test_a_hand_that_only_turns_does_not_pause(self):
         times, still = np.linspace(0, 6, 300), np.linspace(0, 1, 100)
@@ -223,6 +256,21 @@ class TestPreparation:
         ]
         assert np.rad2deg(np.median(off)) < 1
         assert prepare(TAKES).warnings == ()
+
+    def test_a_hand_that_ends_turned_away_from_the_others_is_said_and_does_not_move_the_goal(self):
+        last = TAKES[-1]
+        other = quaternions(rotation(hand(last)) * Rotation.from_rotvec([0.0, 0.0, 1.5]))
+        takes = [*TAKES[:-1], Demonstration(last.times, last.positions, "other", other)]
+        with pytest.warns(dt.DemonstrationWarning, match="'other' ends with the hand turned by 8.*turned there"):
+            motion = dt.fit(takes)
+        ends = np.stack([hand(take)[-1] for take in TAKES[:-1]])
+        assert apart(hand(motion.rollouts()[0])[-1:], mean_orientation(ends)) < 1e-6
+        turns = [np.linspace(0, 1.5 * np.pi, 4)[k] * np.array([0.0, 0.0, 1.0]) for k in range(4)]  # no mean at all
+        around = [
+            Demonstration(t.times, t.positions, t.name, quaternions(rotation(hand(t)) * Rotation.from_rotvec(turn)))
+            for t, turn in zip(TAKES, turns, strict=False)
+        ]
+        assert [len(one.findings) > 0 for one in prepare(around).inspections] == [False, True, True, True]
 
     def test_more_than_half_a_turn_is_said(self):
         with pytest.warns(dt.DemonstrationWarning, match="turns by"):
