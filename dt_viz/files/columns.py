@@ -69,7 +69,7 @@ OTHERS = {
 ANGLES = {"q", "j", "joint", "theta", "angle", "axis", "pos", "position", "positions"}
 """Words of joint angles before a number."""
 JOINTS = {"joint", "joints", "qpos", "angles", "servo", "motor"}
-AROUND_JOINTS = HAND | ANGLES | JOINTS
+AROUND_JOINTS = (HAND - {"gripper"}) | ANGLES | JOINTS
 """Words that may stand beside the name of an arm's joint: ``observation.state.shoulder_pan.pos``."""
 MAX_TURN = 4 * np.pi
 """Largest joint angle, rad; numbers beyond it are degrees."""

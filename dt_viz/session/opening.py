@@ -182,7 +182,8 @@ def _usable(takes: Sequence[Take], robot: Robot) -> tuple[list[Demonstration], l
     errors: list[DemonstrationError] = []
     for take in takes:
         try:
-            used.append((take.joints is None, *demonstrations_of([(Path(take.name), [take], ())], take.name, robot)))
+            (own,) = demonstrations_of([(Path(take.name), [take], ())], take.name, robot)
+            used.append((take.joints is None, own))
         except DemonstrationError as error:
             errors.append(error)
             refused.append(f"not used: {error}")

@@ -367,7 +367,11 @@ class TestJoints:
         ],
     )
     def test_columns_named_as_the_arms_joints_are_its_angles(self, tmp_path, suffix, names, size):
-        columns = dict(zip([*names, "elbow_vel", "action.elbow"], size * self.Q[:, [1, 0, 0, 0]].T, strict=True))
+        columns = dict(
+            zip(
+                [*names, "elbow_vel", "action.elbow", "gripper_elbow"], size * self.Q[:, [1, 0, 0, 0, 0]].T, strict=True
+            )
+        )
         path = tmp_path / f"a{suffix}"
         if suffix == ".csv":
             path.write_bytes(table(["t", *columns], [TIMES, *columns.values()]))
