@@ -24,7 +24,7 @@ LASA_UNITS = {"length": 1e-3, "time": 1.0}
 """Units of the LASA handwriting data: millimetres and seconds."""
 
 
-def read_npz(file: BinaryIO, source: Path, _options: ReadOptions) -> Iterator[Table]:
+def read_npz(file: BinaryIO, source: Path, options: ReadOptions) -> Iterator[Table]:
     """Read named arrays; ``times_i``, ``positions_i`` and ``name_i``, as this program writes them, are metres."""
     arrays = arrays_of(file, max_bytes=LIMITS.bytes)
     ours = all(re.fullmatch(r"(?:times|positions|orientations_wxyz|name)_\d+", key) for key in arrays)
@@ -34,11 +34,11 @@ def read_npz(file: BinaryIO, source: Path, _options: ReadOptions) -> Iterator[Ta
     if ours and timed and placed and timed != placed:
         number = min(timed ^ placed)
         raise FormatError("arrays", f"only one of times_{number} and positions_{number}", "both")
-    for table in tables_of(arrays, source.stem):
+    for table in tables_of(arrays, source.stem, options.joint_names):
         yield Table(table.name, table.columns, units={"length": 1.0, "time": 1.0} if ours else {})
 
 
-def read_npy(file: BinaryIO, source: Path, _options: ReadOptions) -> Iterator[Table]:
+def read_npy(file: BinaryIO, source: Path, options: ReadOptions) -> Iterator[Table]:
     """Read one array (T, d) or (N, T, d), perhaps with named fields."""
     try:
         array = np.load(file, allow_pickle=False)
@@ -49,15 +49,17 @@ def read_npy(file: BinaryIO, source: Path, _options: ReadOptions) -> Iterator[Ta
         raise FormatError("array", "Python objects, which are never unpickled", accepted) from error
     if not isinstance(array, np.ndarray):
         raise FormatError("file", "an archive of several arrays", "one array, or the suffix .npz")
-    yield from tables_of(array, source.stem)
+    yield from tables_of(array, source.stem, options.joint_names)
 
 
-def read_mat(file: BinaryIO, source: Path, _options: ReadOptions) -> Iterator[Table]:
+def read_mat(file: BinaryIO, source: Path, options: ReadOptions) -> Iterator[Table]:
     """Read MATLAB variables; ``demos``, a cell array of structures with t and pos, is LASA's, in millimetres."""
     _check_matlab(file)
     variables = scipy.io.loadmat(file, simplify_cells=True)
     if "demos" not in variables:
-        yield from tables_of({k: v for k, v in variables.items() if not k.startswith("__")}, source.stem)
+        yield from tables_of(
+            {k: v for k, v in variables.items() if not k.startswith("__")}, source.stem, options.joint_names
+        )
         return
     recordings = np.atleast_1d(np.asarray(variables["demos"], dtype=object)).ravel()
     for i, recording in enumerate(recordings):
@@ -98,11 +100,11 @@ def _check_elements(data: memoryview, order: str) -> None:
             place += size + (-size % 8 if kind != 15 else 0)
 
 
-def read_json(file: BinaryIO, source: Path, _options: ReadOptions) -> Iterator[Table]:
+def read_json(file: BinaryIO, source: Path, options: ReadOptions) -> Iterator[Table]:
     """Read lists of numbers, records with named fields, or mappings of them."""
     content = file.read(LIMITS.text + 1)
     check_size(len(content), LIMITS.text)
-    yield from tables_of(json.loads(content), source.stem)
+    yield from tables_of(json.loads(content), source.stem, options.joint_names)
 
 
 def read_parquet(content: BinaryIO, source: Path, options: ReadOptions) -> Iterator[Table]:
@@ -110,7 +112,9 @@ def read_parquet(content: BinaryIO, source: Path, options: ReadOptions) -> Itera
     file = imported("pyarrow.parquet", "parquet").ParquetFile(content, pre_buffer=False)
     given = {name.lower() for name in options.roles.values()}
     kinds = {field.name: str(field.type) for field in file.schema_arrow}
-    names = [name for name in kinds if role_of(name) or name.lower() in given or "list" in kinds[name]]
+    names = [
+        name for name in kinds if role_of(name, options.joint_names) or name.lower() in given or "list" in kinds[name]
+    ]
     parts: dict[str, list[np.ndarray]] = {name: [] for name in names}
     size = 0
     for batch in file.iter_batches(2**16, columns=names):
@@ -127,7 +131,7 @@ def read_parquet(content: BinaryIO, source: Path, options: ReadOptions) -> Itera
     yield Table(source.stem, columns, unused=tuple(name for name in kinds if name not in columns))
 
 
-def read_hdf5(file: BinaryIO, source: Path, _options: ReadOptions) -> Iterator[Table]:
+def read_hdf5(file: BinaryIO, source: Path, options: ReadOptions) -> Iterator[Table]:
     """Read groups of arrays, such as robomimic's: ``data/demo_0/obs/robot0_eef_pos``; pictures are left out."""
     h5py = imported("h5py", "hdf5")
     size = 0
@@ -153,7 +157,7 @@ def read_hdf5(file: BinaryIO, source: Path, _options: ReadOptions) -> Iterator[T
         tree = tree_of(archive)
         data = archive.get("data")
         rate = _control_rate(data.attrs.get("env_args", "")) if isinstance(data, h5py.Group) else None
-    for table in tables_of(tree, source.stem):
+    for table in tables_of(tree, source.stem, options.joint_names):
         columns = table.columns if rate is None else {**table.columns, "rate": np.array(rate)}
         yield Table(table.name, columns)
 

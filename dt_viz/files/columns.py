@@ -69,6 +69,8 @@ OTHERS = {
 ANGLES = {"q", "j", "joint", "theta", "angle", "axis", "pos", "position", "positions"}
 """Words of joint angles before a number."""
 JOINTS = {"joint", "joints", "qpos", "angles", "servo", "motor"}
+AROUND_JOINTS = (HAND - {"gripper"}) | ANGLES | JOINTS
+"""Words that may stand beside the name of an arm's joint: ``observation.state.shoulder_pan.pos``."""
 MAX_TURN = 4 * np.pi
 """Largest joint angle, rad; numbers beyond it are degrees."""
 
@@ -96,9 +98,10 @@ def unit_of(word: str) -> str:
 
 
 @lru_cache(maxsize=4096)
-def role_of(name: str) -> Role | None:
-    """Tell what a column of numbers is by its name; None if it is not used."""
+def role_of(name: str, joint_names: tuple[str, ...] = ()) -> Role | None:
+    """Tell what a column of numbers is by its name, if it is none of an arm's joints; None if it is not used."""
     words = _words(name)
+    own = [joint for joint in joint_names if _is_named(words, _words(joint))]
     if words == ["%time"]:  # of `rostopic echo -p`
         return Role("time", unit="ns")
     unit = unit_of(words[-1]) if words else ""
@@ -108,14 +111,16 @@ def role_of(name: str) -> Role | None:
         return Role("time", rank=1, unit=unit)
     else:
         unit = ""
+    if own:
+        joint = max(own, key=lambda joint: len(_words(joint)))  # joint_1 is in gripper_joint_1, too
+        return Role("joint", (joint,), rank=len(words) - len(_words(joint)), unit=unit)
     if "_".join(words) in RATES:
         return Role("rate", tuple(words), unit=unit)
     label = [word for word in words if word not in {"id", "index", "idx", "number", "no", "num", "name"}]
     if len(label) == 1 and label[0] in LABELS:
         return Role("label", rank=LABELS.index(label[0]))
-    if words == ["t"] or set(words) & (TIMES - {"t"}):
-        return Role("time", tuple(words), rank=len(words) - 1, unit=unit)
-    return _place(words, unit)
+    is_time = words == ["t"] or set(words) & (TIMES - {"t"})
+    return Role("time", tuple(words), rank=len(words) - 1, unit=unit) if is_time else _place(words, unit)
 
 
 def _place(words: list[str], unit: str) -> Role | None:
@@ -143,6 +148,14 @@ def _is_joint(words: list[str]) -> bool:
     numbered = words[-1].isdecimal() and words[:-1] and words[-2] in ANGLES
     fused = re.fullmatch(r"([a-z]+)\d+", words[-1])
     return bool(set(words) & JOINTS or numbered or (fused and fused[1] in ANGLES))
+
+
+def _is_named(words: Sequence[str], joint: Sequence[str]) -> bool:
+    """Tell whether these words hold a joint's, one after the other, and none but those around it and of units."""
+    at = next((k for k in range(len(words)) if [*words[k : k + len(joint)]] == [*joint]), None)
+    if at is None or not joint:
+        return False
+    return {*words[:at], *words[at + len(joint) :]} <= AROUND_JOINTS | {*UNITS, *_SYNONYMS}
 
 
 def _words(name: str) -> list[str]:
@@ -260,6 +273,10 @@ class Layout:
     orientations: tuple[str, ...] = ()
     """w, x, y, z, or none."""
     joints: tuple[str, ...] = ()
+    joint_names: tuple[str, ...] = ()
+    """Names of the joints: the arm's where they are known, otherwise of the columns."""
+    units: tuple[str, ...] = ()
+    """Units that names of times, positions and joints end in."""
 
     @property
     def used(self) -> set[str]:
@@ -268,20 +285,20 @@ class Layout:
         return {*named, *self.positions, *self.orientations, *self.joints} - {""}
 
 
-def layout(names: Sequence[str], others: Sequence[str] = ()) -> Layout:
-    """Find the columns of a table by their names; others of the file are for messages.
+def layout(names: Sequence[str], others: Sequence[str] = (), joint_names: tuple[str, ...] = ()) -> Layout:
+    """Find the columns of a table by their names, or an arm's names of joints; others of the file are for messages.
 
     Raises:
         FormatError: there are neither places nor joint angles, or several places that are alike.
     """
-    roles = {name: role for name in names if (role := role_of(name))}
+    roles = {name: role for name in names if (role := role_of(name, joint_names))}
     by_kind = {
         kind: sorted((name for name in roles if roles[name].kind == kind), key=lambda name: roles[name].rank)
         for kind in ("time", "label", "rate", "position", "orientation", "joint")
     }
     time, fraction = _clock(by_kind["time"], roles)
     positions, group = _position_columns(by_kind["position"], roles, names)
-    joints = tuple(by_kind["joint"])
+    joints = _joint_columns(by_kind["joint"], roles, joint_names)
     if positions and roles[positions[0]].rank < WANTED_RANK:
         joints = ()
     elif joints:
@@ -290,7 +307,19 @@ def layout(names: Sequence[str], others: Sequence[str] = ()) -> Layout:
         raise _unclear("no places", [*names, *others], names)
     first = {kind: next(iter(by_kind[kind]), "") for kind in ("label", "rate")}
     orientations = _orientation_columns(by_kind["orientation"], roles, group) if len(positions) == 3 else ()
-    return Layout(time, fraction, first["label"], first["rate"], positions, orientations, joints)
+    known = tuple(next(iter(roles[name].group), name.removeprefix("joint.")) for name in joints)
+    units = tuple(roles[name].unit for name in (time, *positions, *joints) if name)
+    return Layout(time, fraction, first["label"], first["rate"], positions, orientations, joints, known, units)
+
+
+def _joint_columns(names: Sequence[str], roles: Mapping[str, Role], joint_names: Sequence[str]) -> tuple[str, ...]:
+    """Return the columns of an arm's joints, for each the one with the fewest words, if it has all; otherwise all."""
+    by_joint: dict[str, str] = {}
+    for name in names:
+        for joint in roles[name].group:
+            by_joint.setdefault(joint, name)
+    whole = bool(joint_names) and set(joint_names) <= set(by_joint)
+    return tuple(by_joint[joint] for joint in joint_names) if whole else tuple(names)
 
 
 def _unclear(what: str, names: Sequence[str], choices: Sequence[str]) -> UnclearError:

@@ -74,10 +74,12 @@ class Recordings:
     """By what they are about."""
 
 
-def request(files: Sequence[tuple[str, bytes]], answers: Answers, num_joints: int) -> tuple[bytes, dict[str, Any]]:
+def request(
+    files: Sequence[tuple[str, bytes]], answers: Answers, joint_names: Sequence[str]
+) -> tuple[bytes, dict[str, Any]]:
     """Return the content and the options with which the process reads files, each with its name."""
-    options = {"files": [[name, len(content)] for name, content in files], "answers": answers, "num_joints": num_joints}
-    return b"".join(content for _, content in files), options
+    options = {"files": [[name, len(content)] for name, content in files], "answers": answers}
+    return b"".join(content for _, content in files), options | {"joint_names": [*joint_names]}
 
 
 def recordings_of(arrays: Sequence[np.ndarray]) -> Recordings:
@@ -101,17 +103,20 @@ def recordings_of(arrays: Sequence[np.ndarray]) -> Recordings:
 
 
 def answer_recordings(
-    content: bytes, _suffix: str, files: Sequence[Sequence[Any]], answers: Answers, num_joints: int
+    content: bytes, _suffix: str, files: Sequence[Sequence[Any]], answers: Answers, joint_names: Sequence[str]
 ) -> tuple[tuple[np.ndarray, ...], tuple[str, ...]]:
     """Read recordings in the process of `dt_viz.files.worker`: an array of JSON text, and those of each take."""
     found, at = Recordings(), 0
-    options = ReadOptions(num_joints=num_joints, asks=True)
+    refused: list[DataError] = []
+    options = ReadOptions(joint_names=tuple(joint_names), asks=True)
     with TemporaryDirectory() as folder:
         for number, (name, size) in enumerate(files):
             part, at = content[at : at + size], at + size
-            found = _read_upload(found, part, Path(name), Path(folder, str(number)), answers, options)
-    if not found.takes and found.refused:
-        raise FormatError("files", found.refused[0], "recordings of a hand, or of an arm's joints")
+            found = _read_upload(found, part, Path(name), Path(folder, str(number)), answers, options, refused)
+    if not found.takes and refused:
+        first = refused[0]
+        inside = f"{first.source}: " * (first.source != files[0][0] or len(files) > 1)
+        raise FormatError(inside + first.field, first.found, first.accepted)
     told = {
         "takes": [
             {"name": t.name, "turns": t.orientations is not None, "joints": t.joint_names, "units": t.units}
@@ -119,7 +124,7 @@ def answer_recordings(
             for t in found.takes
         ],
         "notes": _grouped(found.notes),
-        "refused": found.refused,
+        "refused": [str(error) for error in refused],
         "asked": {about: asdict(question) for about, question in found.questions.items()},
     }
     arrays = [(t.times, _values(t), *([] if t.orientations is None else [t.orientations])) for t in found.takes]
@@ -142,9 +147,15 @@ def _values(take: Take) -> np.ndarray:
 
 
 def _read_upload(
-    found: Recordings, content: bytes, name: Path, folder: Path, answers: Answers, options: ReadOptions
+    found: Recordings,
+    content: bytes,
+    name: Path,
+    folder: Path,
+    answers: Answers,
+    options: ReadOptions,
+    refused: list[DataError],
 ) -> Recordings:
-    """Add what one upload holds to what was found."""
+    """Add what one upload holds to what was found, and why files are not read to what was `refused`."""
     sources: Iterator[tuple[str, Read]] = iter([(name.name, lambda how: read_takes(content, name, how))])
     if name.suffix.lower() == ARCHIVE:
         try:
@@ -152,14 +163,15 @@ def _read_upload(
                 unused, sources = _unpack(content, folder), _sources(folder)
                 found = replace(found, notes=(*found.notes, *(f"{name.name}: {note}" for note in unused)))
         except DataError as error:
-            return replace(found, refused=(*found.refused, str(error)))
+            refused.append(error)
+            return found
     for label, read in sources:
         accepted = READERS.get(Path(label).suffix.lower(), (None, "a file of recorded motions"))[1]
         try:
             with parsing(DataError, label, "file", accepted):
                 found = _added(found, label, read, answers, options)
         except DataError as error:
-            found = replace(found, refused=(*found.refused, str(error)))
+            refused.append(error)
     return found
 
 
@@ -172,8 +184,8 @@ def _unpack(content: bytes, folder: Path) -> tuple[str, ...]:
         others = [member.filename for member in members if Path(member.filename).suffix.lower() not in READERS]
         for member in members:
             archive.extract(member, folder)
-    if not members:
-        raise FormatError("archive", "no files", "files of recorded motions")
+    if len(others) == len(members):
+        raise FormatError("archive", ", ".join(others)[:200] or "no files", f"files of the kinds {', '.join(READERS)}")
     unused = [name for name in others if not name.endswith(("metadata.yaml", ".zstd"))]
     return (f"not read are {', '.join(unused)[:200]}",) if unused else ()
 
@@ -209,7 +221,9 @@ def _added(found: Recordings, name: str, read: Read, answers: Answers, options: 
         check_finite(take.times[:, None], f"times of {take.name!r}", take.place)
         check_finite(_values(take), f"values of {take.name!r}", take.place)
     total = sum(_values(take).size for take in (*found.takes, *takes))
-    check_at_most("takes", total, LIMITS.numbers, "numbers on the page; the command line takes more")
+    if total > LIMITS.numbers:
+        accepted = f"at most {LIMITS.numbers} on the page; the command line takes more"
+        raise FormatError("takes", f"{total} numbers", accepted)
     noted = (f"{name}: {note}" for note in notes if "rate=" not in note)
     return replace(found, takes=(*found.takes, *takes), notes=(*found.notes, *noted), questions=questions)
 

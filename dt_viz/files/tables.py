@@ -49,10 +49,15 @@ class ReadOptions:
     """Names of a table's columns in their order, or the columns to use by what they are: ``{"x": "column"}``."""
     topic: str | None = None
     """Topic of a bag, or child frame of its transforms."""
-    num_joints: int | None = None
-    """Number of joints of the arm at hand."""
+    joint_names: tuple[str, ...] = ()
+    """Names of the joints of the arm at hand; empty without one."""
     asks: bool = False
     """Whether what is not clear is asked, of all columns, rather than guessed."""
+
+    @property
+    def num_joints(self) -> int | None:
+        """Number of joints of the arm at hand."""
+        return len(self.joint_names) or None
 
     @property
     def names(self) -> list[str] | None:
@@ -121,7 +126,8 @@ def read_text(file: BinaryIO, source: Path, options: ReadOptions) -> Iterator[Ta
         raise FormatError("columns", f"{len(given)} names for {width} columns", f"{width} names")
     names = given or header
     lower = {name.lower() for name in options.roles.values()}
-    wanted = [not names or options.asks or role_of(names[k]) or names[k].lower() in lower for k in range(width)]
+    by_name = [bool(role_of(name, options.joint_names)) or name.lower() in lower for name in names]
+    wanted = [not names or options.asks or by_name[k] for k in range(width)]
     labels: dict[str, float] = {}
     label = [bool(names) and _is_label(names[k], options) for k in range(width)]
     used = [

@@ -121,7 +121,7 @@ def _given_units(text: str | None) -> dict[str, float]:
 def _split(table: Table, options: ReadOptions, notes: dict[str, None]) -> Iterator[Take]:
     """Takes of a table, in its own units."""
     columns = _named_columns(table, options)
-    found = layout([*columns], table.unused)
+    found = layout([*columns], table.unused, options.joint_names)
     if others := [name for name in (*columns, *table.unused) if name not in {*found.used, "name", ""}]:
         notes[f"columns {', '.join(others)[:200]} are not used"] = None
     units = _units_of(found) | table.units
@@ -152,8 +152,7 @@ def _split(table: Table, options: ReadOptions, notes: dict[str, None]) -> Iterat
         if found.positions:
             yield Take(name, seconds, values, turns, None, (), place, units, is_timed)
         else:
-            joint_names = tuple(joint.removeprefix("joint.") for joint in found.joints)
-            yield Take(name, seconds, None, None, values, joint_names, place, units, is_timed)
+            yield Take(name, seconds, None, None, values, found.joint_names, place, units, is_timed)
 
 
 def _named_columns(table: Table, options: ReadOptions) -> dict[str, np.ndarray]:
@@ -193,9 +192,8 @@ def _stacked(columns: Mapping[str, np.ndarray], names: Sequence[str], rows: Rows
 
 def _units_of(found: Layout) -> dict[str, float]:
     """Sizes of the units that the names of columns end in."""
-    named = [role.unit for name in (found.time, *found.positions, *found.joints) if (role := role_of(name))]
     units: dict[str, float] = {}
-    for kind, size in (UNITS[unit] for unit in named if unit):
+    for kind, size in (UNITS[unit] for unit in found.units if unit):
         if units.setdefault(kind, size) != size:
             raise FormatError("columns", f"several units of one {kind}", "one unit for each kind of quantity")
     return units

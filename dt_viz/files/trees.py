@@ -17,7 +17,11 @@ from dt_viz.files.tables import Table
 ACCEPTED = "times (T,) and positions (T, d), d 2 or 3, of one take or of each; or arrays (T, d) or (N, T, d)"
 
 
-def tables_of(tree: Any, name: str) -> Iterator[Table]:  # noqa: ANN401 - whatever a file holds
+def tables_of(
+    tree: Any,  # noqa: ANN401 - whatever a file holds
+    name: str,
+    joint_names: tuple[str, ...] = (),
+) -> Iterator[Table]:
     """Find the takes of nested mappings, lists and arrays.
 
     An array (T, d) is a take, (N, T, d) are several. A mapping whose names tell times, positions or joint angles is a
@@ -26,12 +30,13 @@ def tables_of(tree: Any, name: str) -> Iterator[Table]:  # noqa: ANN401 - whatev
     Args:
         tree: mappings, lists, arrays and numbers.
         name: name of the takes.
+        joint_names: names of an arm's joints, which are names of joint angles.
 
     Raises:
         FormatError: there is none.
     """
     found = False
-    for table in _tables(condensed(tree), name):
+    for table in _tables(condensed(tree), name, joint_names):
         found = True
         yield table
     if not found:
@@ -90,11 +95,11 @@ def _columns(records: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarra
     return {key: np.stack([record[key] for record in records]) for key in records[0]}
 
 
-def _tables(tree: Any, name: str) -> Iterator[Table]:  # noqa: ANN401 - condensed data
+def _tables(tree: Any, name: str, joints: tuple[str, ...]) -> Iterator[Table]:  # noqa: ANN401 - condensed data
     if isinstance(tree, Mapping):
-        yield from _of_mapping(tree, name)
+        yield from _of_mapping(tree, name, joints)
     elif isinstance(tree, list):
-        takes = [list(_tables(item, f"{name} {k}" if len(tree) > 1 else name)) for k, item in enumerate(tree)]
+        takes = [list(_tables(item, f"{name} {k}" if len(tree) > 1 else name, joints)) for k, item in enumerate(tree)]
         if any(takes) and not all(takes):
             raise FormatError(f"take {takes.index([]) + 1}", "no places", ACCEPTED)
         yield from itertools.chain.from_iterable(takes)
@@ -114,24 +119,26 @@ def _lettered(arrays: Mapping[str, np.ndarray]) -> bool:
     return len(arrays) > 1 and set(arrays) <= set("abcdefg")
 
 
-def _of_mapping(tree: Mapping[str, Any], name: str) -> Iterator[Table]:
+def _of_mapping(tree: Mapping[str, Any], name: str, joints: tuple[str, ...]) -> Iterator[Table]:
     own = {key: value for key, value in tree.items() if isinstance(value, np.ndarray)}
-    if numbered := _numbered(own):
+    if numbered := _numbered(own, joints):
         for k, arrays in numbered.items():
             yield from _several(arrays, f"{name} {k}")
     elif (
-        not _lettered(own) and any(value.ndim for value in own.values()) and _tells(arrays := _all_upright(flat(tree)))
+        not _lettered(own)
+        and any(value.ndim for value in own.values())
+        and _tells(arrays := _all_upright(flat(tree)), joints)
     ):
         yield from _several(arrays, name)
     else:
         parts = {key: value for key, value in tree.items() if key not in own or (own[key].ndim > 1 and is_place(key))}
         rates = {key: value for key, value in own.items() if not value.ndim and is_kind(key, "rate")}
         for key, value in parts.items():
-            for table in _tables(value, name if len(parts) == 1 else key):
+            for table in _tables(value, name if len(parts) == 1 else key, joints):
                 yield replace(table, columns={**rates, **table.columns})
 
 
-def _numbered(arrays: Mapping[str, np.ndarray]) -> dict[int, dict[str, np.ndarray]]:
+def _numbered(arrays: Mapping[str, np.ndarray], joints: tuple[str, ...]) -> dict[int, dict[str, np.ndarray]]:
     """Arrays of each take by its number, if all their names end in such: ``times_0``, ``positions_0``, …."""
     takes: dict[int, dict[str, np.ndarray]] = {}
     for key, value in arrays.items():
@@ -140,7 +147,7 @@ def _numbered(arrays: Mapping[str, np.ndarray]) -> dict[int, dict[str, np.ndarra
         elif value.ndim:
             return {}
     takes = {k: _all_upright(takes[k]) for k in sorted(takes)}
-    whole = all(_tells(take) and max(value.ndim for value in take.values()) > 1 for take in takes.values())
+    whole = all(_tells(take, joints) and max(value.ndim for value in take.values()) > 1 for take in takes.values())
     return takes if whole else {}
 
 
@@ -159,11 +166,12 @@ def _upright(array: np.ndarray, length: int | None) -> np.ndarray:
     return np.swapaxes(array, -1, -2) if lies else array
 
 
-def _tells(arrays: Mapping[str, np.ndarray]) -> bool:
+def _tells(arrays: Mapping[str, np.ndarray], joints: tuple[str, ...]) -> bool:
     """Tell whether the names of these arrays say what is a place or a joint angle."""
     columns = {key: value[0] if value.ndim == 3 and len(value) else value for key, value in arrays.items()}
     try:
-        return bool(layout([name for key, value in columns.items() if value.ndim for name in expanded(key, value)]))
+        names = [name for key, value in columns.items() if value.ndim for name in expanded(key, value)]
+        return bool(layout(names, joint_names=joints))
     except FormatError:
         return False
 

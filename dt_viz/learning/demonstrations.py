@@ -230,7 +230,7 @@ def load_demonstrations(
             package that is not installed, has columns that are not clear, or holds demonstrations that
             :func:`check_demonstrations` refuses; or there are times beside a rate, or joint angles without an arm.
     """
-    options = ReadOptions(rate, unit, columns, topic, _num_joints(arm))
+    options = ReadOptions(rate, unit, columns, topic, () if arm is None else tuple(arm.joint_names))
     sources = [Path(path)] if isinstance(path, str | Path) else [*map(Path, path)]
     found = [read for source in sources for read in _found_in(source, options)]
     return demonstrations_of(found, ", ".join(map(str, sources))[:200], arm)
@@ -257,7 +257,7 @@ def read_demonstrations(
         topic: see there.
         arm: see there.
     """
-    options = ReadOptions(rate, unit, columns, topic, _num_joints(arm))
+    options = ReadOptions(rate, unit, columns, topic, () if arm is None else tuple(arm.joint_names))
     return demonstrations_of([_read(io.BytesIO(content), Path(source), options)], source, arm)
 
 
@@ -281,7 +281,9 @@ def demonstrations_of(
     for note, paths in said.items():
         logger.warning("%s%s: %s", paths[0], f" and {len(paths) - 1} more" * (len(paths) > 1), note)
     with parsing(DemonstrationError, source, "takes", "recorded motions"):
-        takes, note = in_si_units([take for _, some, _ in found for take in some], _num_joints(arm))
+        takes, note = in_si_units(
+            [take for _, some, _ in found for take in some], None if arm is None else len(arm.joint_names)
+        )
         takes = [_in_frame_of(take, arm) for take in takes]
         if note:
             logger.warning("%s: %s", source, note)
@@ -327,10 +329,6 @@ def _read(file: BinaryIO, source: Path, options: ReadOptions) -> Found:
     accepted = READERS.get(source.suffix.lower(), (None, "a file of recorded motions"))[1]
     with parsing(DemonstrationError, source, "file", accepted):
         return (source, *read_takes(file, source, options))
-
-
-def _num_joints(arm: ForwardKinematics | None) -> int | None:
-    return None if arm is None else len(arm.joint_names)
 
 
 def _in_frame_of(take: Take, arm: ForwardKinematics | None) -> Take:

@@ -101,7 +101,7 @@ def read(
     """
     name = files[0][0] if len(files) == 1 else f"{len(files)} files"
     with parsing(DemonstrationError, name, "file", "recorded motions"):
-        content, options = request(files, answers, len(robot.joint_names))
+        content, options = request(files, answers, robot.joint_names)
         arrays, _ = read_upload("takes", "recording", content, cancelled, options)
         return recordings_of(arrays)
 
@@ -177,16 +177,19 @@ def _rate(takes: list[Take], choices: Choices) -> float | None:
 
 def _usable(takes: Sequence[Take], robot: Robot) -> tuple[list[Demonstration], list[str]]:
     """Demonstrations of the takes that are of the kind of most, and a line for each that cannot be used."""
-    used, refused = [], []
+    used: list[tuple[bool, Demonstration]] = []
+    refused: list[str] = []
+    errors: list[DemonstrationError] = []
     for take in takes:
         try:
-            used.append((take.joints is None, *demonstrations_of([(Path(take.name), [take], ())], take.name, robot)))
+            (own,) = demonstrations_of([(Path(take.name), [take], ())], take.name, robot)
+            used.append((take.joints is None, own))
         except DemonstrationError as error:
+            errors.append(error)
             refused.append(f"not used: {error}")
     kinds = Counter((of_hand, own.dimension) for of_hand, own in used)
     if not kinds:
-        first = refused[0] if refused else "no takes"
-        raise DemonstrationError("recordings", "takes", first, "at least one motion")
+        raise errors[0] if errors else DemonstrationError("recordings", "takes", "none", "at least one motion")
     (kind, _), *_ = kinds.most_common(1)
     words = {True: "places of the hand", False: "joint angles"}
     for of_hand, own in used:

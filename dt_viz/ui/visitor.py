@@ -169,6 +169,7 @@ class Visitor(Display):
             self.pictures.take(self.client.scene, robot)
             self.robot.paint(self._theme)
             self.robot.adopt(self.session.scenario.view, self.pictures.look)
+            self.robot.set_aside(self._previews)
             self._panel.take(robot)
         self.robot.playback.begin(self.session.jobs, self.session.fail)  # and the one before ends
         self._camera.reframe(arm_size=robot.size)

@@ -28,12 +28,13 @@ def table(names, columns):
     return "\n".join([",".join(names), *rows]).encode()
 
 
+JOINT_NAMES = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "wrist_yaw")
 TIMED = table(HEADER, [TIMES, *path_of().T])
 
 
 def read(*files, answers=None, process=False):
     """What is read of files, each a name and its content."""
-    content, options = request(files, answers or {}, 6)
+    content, options = request(files, answers or {}, JOINT_NAMES)
     if process:
         return recordings_of(read_upload("takes", "recording", content, options=options)[0])
     arrays, _ = answer_recordings(content, "recording", **json.loads(json.dumps(options)))
@@ -64,6 +65,20 @@ def test_several_files_and_an_archive_of_their_folder_give_the_same_takes(proces
         np.testing.assert_array_equal(take.positions, path_of(k))
         np.testing.assert_array_equal(take.positions, same.positions)
     assert one.refused == other.refused == one.notes == other.notes == ()
+
+
+@pytest.mark.parametrize("process", [False, True])
+def test_columns_named_as_the_joints_of_the_arm_are_its_angles(process):
+    angles = np.random.default_rng(4).normal(size=(6, 60))
+    given = [*zip(JOINT_NAMES, angles, strict=True)][::-1]
+    files = {
+        "a.csv": table(["t", *(name for name, _ in given)], [TIMES, *(values for _, values in given)]),
+        "b.csv": table(["t", *(f"{name}.pos" for name in JOINT_NAMES), "gripper.pos"], [TIMES, *angles, TIMES]),
+    }
+    found = read(*files.items(), process=process)
+    assert [take.joint_names for take in found.takes] == [JOINT_NAMES, JOINT_NAMES] and not found.questions
+    for take in found.takes:
+        np.testing.assert_array_equal(take.joints, angles.T)
 
 
 def test_joint_angles_orientations_and_missing_times_come_through():
@@ -200,3 +215,17 @@ def test_more_numbers_than_a_visitor_may_keep_are_refused(monkeypatch):
 def test_where_nothing_can_be_read_the_first_reason_is_given():
     with pytest.raises(FormatError, match=r"a\.csv: file: found an empty file"):
         read(("a.csv", b""), ("b.csv", b""))
+
+
+def test_where_nothing_can_be_read_the_reason_is_said_once():
+    nested = zipped({"takes.zip": zipped({"a.csv": TIMED})})
+    broken = TIMED.replace(TIMED.splitlines()[3], b"1,2")
+    for files, said in (
+        ([("a.csv", broken)], "line 4: found 2 columns; accepted: 4, as in the first line"),
+        ([("a.csv", broken), ("b.csv", b"")], "a.csv: line 4: found 2 columns; accepted: 4, as in the first line"),
+        ([("a.zip", zipped({"b.csv": broken}))], "b.csv: line 4: found 2 columns; accepted: 4, as in the first line"),
+        ([("a.zip", nested)], "archive: found takes.zip; accepted: files of the kinds .csv, "),
+    ):
+        with pytest.raises(FormatError) as raised:
+            read(*files)
+        assert str(raised.value).startswith(said) and str(raised.value).count("accepted") == 1

@@ -341,7 +341,7 @@ class TestJoints:
         ("names", "order", "size"),
         [
             (["q1", "q2"], [0, 1], 1.0),
-            (["joint_elbow", "joint_shoulder"], [0, 1], 1.0),
+            (["joint_elbow", "joint_shoulder"], [1, 0], 1.0),
             (["joint.elbow", "joint.shoulder"], [1, 0], 1.0),
             (["J1_deg", "J2_deg"], [0, 1], 180 / np.pi),
             (["position0", "position1"], [0, 1], 1.0),
@@ -354,6 +354,42 @@ class TestJoints:
         assert_same(read, Planar().end_effector(self.Q))
         message = refusal(content, "a.csv")
         assert "angles of 2 joints" in message and "arm=…" in message
+
+    @pytest.mark.parametrize("suffix", [".csv", ".npz", ".parquet"])
+    @pytest.mark.parametrize(
+        ("names", "size"),
+        [
+            (["elbow", "shoulder"], 1.0),
+            (["Elbow", "Shoulder"], 1.0),
+            (["elbow.pos", "shoulder.pos"], 1.0),
+            (["observation.state.elbow", "observation.state.shoulder"], 1.0),
+            (["elbow_deg", "shoulder_deg"], 180 / np.pi),
+        ],
+    )
+    def test_columns_named_as_the_arms_joints_are_its_angles(self, tmp_path, suffix, names, size):
+        columns = dict(
+            zip(
+                [*names, "elbow_vel", "action.elbow", "gripper_elbow"], size * self.Q[:, [1, 0, 0, 0, 0]].T, strict=True
+            )
+        )
+        path = tmp_path / f"a{suffix}"
+        if suffix == ".csv":
+            path.write_bytes(table(["t", *columns], [TIMES, *columns.values()]))
+        elif suffix == ".npz":
+            np.savez(path, t=TIMES, **columns)
+        else:
+            pq, pa = pytest.importorskip("pyarrow.parquet"), pytest.importorskip("pyarrow")
+            pq.write_table(pa.table({"t": TIMES, **columns}), path)
+        assert_same(load_demonstrations(path, arm=Planar())[0], Planar().end_effector(self.Q))
+        with pytest.raises(DemonstrationError, match=r"no places|no takes"):
+            load_demonstrations(path)
+
+    def test_some_of_the_arms_joints_are_refused_with_their_names(self):
+        content = table(["t", "shoulder", "wrist"], [TIMES, *self.Q.T])
+        with pytest.raises(
+            DemonstrationError, match=r"angles of 1 joints \(shoulder\).*the arm's 2 \(shoulder, elbow\)"
+        ):
+            read_demonstrations(content, "a.csv", arm=Planar())
 
     def test_degrees_are_recognised_and_a_gripper_is_left_out(self, tmp_path):
         np.savez(tmp_path / "a.npz", t=TIMES, qpos=np.column_stack([180 / np.pi * self.Q, np.full(60, 30)]))

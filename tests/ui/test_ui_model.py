@@ -6,6 +6,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+import viser  # noqa: TID251 - forges what a browser sends
 from other_arms import seven_joints
 from pages import NoFrames, Page
 
@@ -13,6 +14,8 @@ from dt_viz.robot.placement import is_jaco
 from dt_viz.robot.urdf import ArmError
 from dt_viz.scenario.paper_scenes import SCENES
 from dt_viz.session.session import CHOICES
+from dt_viz.ui.tabs.from_file import LANE
+from dt_viz.ui.tabs.opening import CHOOSING, SEEING
 
 TITLES = {"": "JACO", "panda": "Franka Panda", "broken": "Broken"}
 OF_JACO = {scene.title for scene in SCENES.values() if scene.of_jaco}
@@ -111,3 +114,42 @@ def test_push_reaches_the_arm_that_is_drawn(page):
     page["Push the hand"].disabled = False
     page.claim(page["Push the hand"], True)
     assert pushed == ["panda"] and np.array_equal(page.session.robot.home, taller().home)
+
+
+def test_takes_that_are_open_are_read_again_for_another_arm(page):
+    def done():
+        for lane in (CHOOSING, LANE, SEEING):
+            assert page.session.jobs.wait_idle(lane, 60)
+
+    robot, u = page.session.robot, np.linspace(0, 1, 100)
+    rows = np.column_stack([3 * u, robot.home + np.outer(u - 1, np.linspace(0.3, 0.1, 6)), np.full(100, 0.5)])
+    header = ",".join(["t", *(f"joint{k}" for k in range(1, 8))])  # six and a gripper, or seven
+    content = "\n".join([header, *(",".join(map(str, row)) for row in rows)]).encode()
+    page.claim(page["Open your demonstrations"], True)
+    done()
+    page.claim(page["Choose files, or drop them here"], viser.UploadedFile("a.csv", content))
+    done()
+    takes = page.visitor.pictures._takes
+    np.testing.assert_allclose(takes.goal.position, robot.end_effector(rows[-1:, 1:7])[0], atol=0.01)
+    choose(page, "Franka Panda")
+    done()
+    page.visitor._exchange("panda")
+    np.testing.assert_allclose(takes.goal.position, taller().end_effector(rows[-1:, 1:])[0], atol=0.01)
+    assert takes.visible and page.visitor.robot._aside and not page["Learn"].disabled
+
+
+def test_takes_of_another_arm_that_are_open_cannot_be_learned_for_this_one(page):
+    u = np.linspace(0, 1, 100)
+    rows = np.column_stack([3 * u, page.session.robot.home + np.outer(u - 1, np.linspace(0.3, 0.1, 6))])
+    header = ",".join(["t", *(f"joint{k}" for k in range(1, 7))])
+    content = "\n".join([header, *(",".join(map(str, row)) for row in rows)]).encode()
+    page.claim(page["Open your demonstrations"], True)
+    assert page.session.jobs.wait_idle(CHOOSING, 60)
+    page.claim(page["Choose files, or drop them here"], viser.UploadedFile("a.csv", content))
+    for title, learns in (("JACO", True), ("Franka Panda", False), ("JACO", True)):
+        choose(page, title)
+        for lane in (LANE, SEEING):
+            assert page.session.jobs.wait_idle(lane, 60)
+        assert page["Learn"].disabled is not learns
+    said = page.session._screen.progress.message
+    assert said is not None and "angles of 6 joints" in said.text

@@ -103,6 +103,7 @@ class OpenPanel:
         self.controls["learn"] = self._control(start, lambda _pressed: self._press())
         self._control(cancel, lambda _pressed: self.close())
         bindings.show(lambda s: (s.task, s.scene), lambda _chosen: self.close())
+        bindings.show(lambda s: s.arm, lambda _arm: self._again())
 
         @self.upload.on_upload
         async def _(_event: viser.GuiEvent) -> None:
@@ -178,6 +179,14 @@ class OpenPanel:
             else:
                 self._opened = replace(self._opened, files=files)
                 session.jobs.submit(LANE, self._read)
+
+    def _again(self) -> None:
+        """Read what is open for another arm: its joints' angles lead elsewhere, and it reaches other places."""
+        with self._changing:
+            if self._opened.files:
+                self._opened, self._seen = replace(self._opened), None  # what is being inspected is not put
+                self._draw()
+                self._bindings.session.jobs.submit(LANE, self._read, latest=True)
 
     def _read(self) -> None:
         """Read the files of what is open with what was answered; without the newest one if it cannot be read.
