@@ -225,7 +225,8 @@ class Follower:
         missed = lifted.tracked.error[:, [0, -1]] > MAX_TRACKING_ERROR
         reasons = [*far_starts(missed[:, 0], np.zeros(len(missed), bool))]
         if missed[:, 1].any():
-            reasons.append(MotionWarning(Kind.OUT_OF_REACH, "the goal is out of the arm's reach", ARM))
+            turned = " with the hand turned as demonstrated" * (learned.demonstrated.orientations is not None)
+            reasons.append(MotionWarning(Kind.OUT_OF_REACH, f"the goal is out of the arm's reach{turned}", ARM))
         return tuple(reasons)
 
     def _pedestal_touched(self, learned: Learned, obstacle: Union) -> tuple[MotionWarning, ...]:

@@ -69,7 +69,7 @@ class Visitor(Display):
         self.client = client
         self.shown: Frame | None = None
         """The last drawn frame."""
-        self._previews = self._learns = False
+        self._previews: bool | None = False  # None: what was seen is being learned, and stays until then
         """Whether takes are seen that are not learned yet, and whether they are being learned."""
         self._dress(LIGHT)
         client.gui.set_panel_label("DT-Viz")
@@ -128,7 +128,7 @@ class Visitor(Display):
 
     def tell(self, progress: Progress) -> None:
         self._panel.tell(progress)
-        if self._learns and (progress.failed or not progress.stale):
+        if self._previews is None and (progress.failed or not progress.stale):
             self._preview(None, 0)  # what was seen is learned, or will not be
 
     def close(self) -> None:
@@ -138,8 +138,8 @@ class Visitor(Display):
 
     def _preview(self, seen: Preview | None, number: int | None) -> None:
         """Show takes that are not learned yet in place of the motion; see `ui.tabs.opening.Show`."""
-        self._learns = number is None
         if number is None:
+            self._previews = None
             return
         begins, before = seen is not None, self._previews
         self._previews = begins
@@ -169,7 +169,7 @@ class Visitor(Display):
             self.pictures.take(self.client.scene, robot)
             self.robot.paint(self._theme)
             self.robot.adopt(self.session.scenario.view, self.pictures.look)
-            self.robot.set_aside(self._previews)
+            self.robot.set_aside(self._previews is not False)
             self._panel.take(robot)
         self.robot.playback.begin(self.session.jobs, self.session.fail)  # and the one before ends
         self._camera.reframe(arm_size=robot.size)

@@ -148,7 +148,7 @@ def test_takes_of_another_arm_that_are_open_cannot_be_learned_for_this_one(page)
     page.claim(page["Choose files, or drop them here"], viser.UploadedFile("a.csv", content))
     for title, learns in (("JACO", True), ("Franka Panda", False), ("JACO", True)):
         choose(page, title)
-        for lane in (LANE, SEEING):
+        for lane in (CHOOSING, LANE, SEEING):
             assert page.session.jobs.wait_idle(lane, 60)
         assert page["Learn"].disabled is not learns
     said = page.session._screen.progress.message
