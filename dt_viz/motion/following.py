@@ -201,7 +201,7 @@ class Follower:
     def _admission(
         self, nominal: Nominal, obstacle: Union, margin: float, last: Posture | None, keeps: bool
     ) -> Admission:
-        blocked = self._unreached(nominal.learned) or self._pedestal_touched(nominal.learned, obstacle)
+        blocked = self.unreached(nominal.learned) or self._pedestal_touched(nominal.learned, obstacle)
         if blocked:
             return Admission(nominal, blocked)
         posture, free = next(self._ranked(nominal.learned, obstacle, margin, last, keeps=keeps))
@@ -216,7 +216,7 @@ class Follower:
         standing = standing.without(self.out_of_reach(standing), StartStatus.OUT_OF_REACH)
         return Admission(standing.without(touches, StartStatus.IN_COLLISION))
 
-    def _unreached(self, learned: Learned) -> tuple[MotionWarning, ...]:
+    def unreached(self, learned: Learned) -> tuple[MotionWarning, ...]:
         """Warnings about the task's starts and goal that are out of the arm's reach."""
         try:
             lifted = self._demonstrated(learned)
@@ -225,8 +225,7 @@ class Follower:
         missed = lifted.tracked.error[:, [0, -1]] > MAX_TRACKING_ERROR
         reasons = [*far_starts(missed[:, 0], np.zeros(len(missed), bool))]
         if missed[:, 1].any():
-            turned = " with the hand turned as demonstrated" * (learned.demonstrated.orientations is not None)
-            reasons.append(MotionWarning(Kind.OUT_OF_REACH, f"the goal is out of the arm's reach{turned}", ARM))
+            reasons.append(MotionWarning(Kind.OUT_OF_REACH, "the goal is out of the arm's reach", ARM))
         return tuple(reasons)
 
     def _pedestal_touched(self, learned: Learned, obstacle: Union) -> tuple[MotionWarning, ...]:

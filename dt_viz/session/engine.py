@@ -36,6 +36,8 @@ from dt_viz.warning import MotionWarning
 
 MOST_OWN = 4
 """Largest number of a visitor's own tasks that are kept; the oldest go first."""
+NOT_TURNED = "the arm does not get there with the hand turned as demonstrated: it follows the places alone"
+"""Warning where orientations are left out."""
 
 _cores = Cores()
 """Slots of all engines."""
@@ -184,7 +186,11 @@ class Engine:
         imitation = fits.learned(task.demonstrations, settings, state, progress)
         if imitation.state == "augmented" and scenario.state == "auto" and not imitation.reason:
             imitation = replace(imitation, reason="the plain state misses a demonstration of this task")
-        return Learned.of(task, imitation, imitates=scenario.imitation)
+        learned = Learned.of(task, imitation, imitates=scenario.imitation)
+        if isinstance(imitation, AugmentedImitation) and learned.poses and self.follower.unreached(learned):
+            places = replace(imitation, goal_orientation=None, warnings=(*imitation.warnings, NOT_TURNED))
+            return Learned.of(task, places, imitates=scenario.imitation)
+        return learned
 
     @kept(NEWEST, by=lambda task: task)
     def _augmented(self, task: str) -> AugmentedImitation:

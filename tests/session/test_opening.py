@@ -8,12 +8,12 @@ import pytest
 
 from dt_viz.files.recordings import Recordings
 from dt_viz.files.takes import Take
-from dt_viz.learning.demonstrations import DemonstrationError
+from dt_viz.learning.demonstrations import Demonstration, DemonstrationError
 from dt_viz.learning.preparation import prepare
 from dt_viz.learning.store import FitStore
 from dt_viz.scenario.scenario import Scenario
-from dt_viz.scenario.tasks import TASKS
-from dt_viz.session.engine import MOST_OWN, Engine
+from dt_viz.scenario.tasks import TASKS, own_task
+from dt_viz.session.engine import MOST_OWN, NOT_TURNED, Engine
 from dt_viz.session.frame import Stage
 from dt_viz.session.history import History
 from dt_viz.session.opening import Choices, preview, with_reach
@@ -235,3 +235,22 @@ def test_undo_forgets_a_task_that_is_gone():
         history.edited(after.task, before, after)
     history.forget("own_data_1")
     assert history.undone(scenarios[-1]) == scenarios[0] and history.undone(scenarios[0]) is None
+
+
+def test_places_are_followed_where_the_arm_cannot_turn_its_hand_as_demonstrated(new_engine, monkeypatch):
+    along = np.linspace(0, 1, 80)[:, None]
+    begin, end = np.array([-0.25, -0.45, 0.15]), np.array([0.2, -0.45, 0.3])
+    upright = np.tile([1.0, 0.0, 0.0, 0.0], (80, 1))
+    takes = [
+        Demonstration(4 * along[:, 0], begin + shift + along * (end - begin - shift), str(k), upright)
+        for k, shift in enumerate(0.02 * np.random.default_rng(0).normal(size=(3, 3)))
+    ]
+    for can in (True, False):
+        engine = new_engine()
+        own, _ = engine.bring(own_task(tuple(takes)), "draw_s")
+        if not can:
+            monkeypatch.setattr(engine.follower, "unreached", lambda learned: ("the goal",) * bool(learned.poses))
+        nominal = engine.nominal(Scenario(own.name))
+        assert (nominal.orientations is not None) is can
+        assert (NOT_TURNED not in nominal.imitation.warnings) is can
+        assert engine.follower.undisturbed(nominal).tracked.error[:, [0, -1]].max() < 1e-3
