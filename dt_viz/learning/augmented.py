@@ -26,9 +26,10 @@ from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.rotations import turned
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem, asinh_exp, log_sinh
 from dt_viz.learning.demonstrations import Demonstration
+from dt_viz.learning.grouping import patterns_of, set_apart, told_by_starts
 from dt_viz.learning.initial_guess import groups_of
 from dt_viz.learning.interface import AnyImitation, State
-from dt_viz.learning.patterns import AugmentedSettings, Pattern, learn_patterns, patterns_of, set_apart, told_by_starts
+from dt_viz.learning.patterns import AugmentedSettings, Pattern, learn_patterns
 from dt_viz.learning.poses import Poses, latest
 from dt_viz.learning.preparation import ImitationError, Motions, prepare
 from dt_viz.learning.timing import ARRIVED, TimedAttractor
