@@ -7,13 +7,16 @@ import pytest
 from browsing import LIGHT, PATIENCE, close_page, open_page, open_tab, press, wait_until
 from chromium import needs_chromium
 from other_arms import seven_joints
+from playwright.sync_api import expect
 
 from dt_viz.session import arms
 
 pytestmark = [pytest.mark.browser, needs_chromium]
 
 
-def choose(page, title):
+def choose(page, title, instead_of):
+    """Choose a model on a page that shows another one: choosing the one that is shown would tell nobody."""
+    expect(page.get_by_label("Model", exact=True).first).to_have_value(instead_of, timeout=1000 * PATIENCE)
     press(page.get_by_label("Model", exact=True).first)
     press(page.get_by_role("option", name=title, exact=True))
 
@@ -36,7 +39,7 @@ def test_the_arm_changes_in_place_and_back_for_its_visitor_alone(browser, server
             each.session.edit("test", view=LIGHT)
         untouched, live = other.session.scenario, other.robot
         open_tab(page, "Arm")
-        choose(page, "Franka Panda")
+        choose(page, "Franka Panda", instead_of="JACO")
         wait_until(lambda: is_shown(visitor, "panda", 7), "the arm with seven joints")
         assert visitor.session.wait_idle(PATIENCE)
         assert visitor.robot.playback.live.q is not None and len(visitor.robot.playback.live.q) == 7
@@ -47,7 +50,7 @@ def test_the_arm_changes_in_place_and_back_for_its_visitor_alone(browser, server
         wait_until(lambda: is_shown(visitor, "", 6), "the arm as before")
         press(page.get_by_role("button", name="Redo"))
         wait_until(lambda: is_shown(visitor, "panda", 7), "the other arm again")
-        choose(page, "JACO")
+        choose(page, "JACO", instead_of="Franka Panda")
         wait_until(lambda: is_shown(visitor, "", 6), "the arm as it was")
         assert visitor.session.wait_idle(PATIENCE)
         assert page.get_by_label("Model", exact=True).first.input_value() == "JACO"

@@ -138,11 +138,18 @@ def test_balls_at_the_goal_the_base_or_around_the_hand_are_told_from_those_that_
     assert postures is not None and len(postures) == len(ends)
     np.testing.assert_allclose(small.end_effector(postures), ends, atol=1e-3)
     assert small.collision.obstacle_distance(postures, ball)[0].min() >= 0.01 - 1e-4
-    assert has_way(small, ball, 0.01, postures, few)
     size = 0.1 * small.size
     assert found(Sphere(as_point(ends[-1]), size)) is None and found(Sphere(as_point(ends[2]), size)) is None
     assert found(Sphere((0.0, 0.0, 0.02), size)) is None  # in the base
     away = ends[-1] + (small.shoulder - ends[-1]) / np.linalg.norm(small.shoulder - ends[-1]) * 0.06
     assert found(Sphere(as_point(away), 0.1)) is None  # where the wrist has to be
+
+
+def test_a_planner_that_knows_nothing_of_ours_tells_whether_there_is_a_way(small, small_engine, ball):
+    pytest.importorskip("ompl", reason="ompl is an extra")
+    ends = small_engine.nominal(Scenario(TASK)).learned.demonstrated.ends
+    few = PassableSettings(num_postures=100, seconds=5.0)
+    postures = postures_at(small, ends, ArmAvoidance(ball), np.random.default_rng(0), few)
+    assert postures is not None and has_way(small, ball, 0.01, postures, few)
     walls = Sphere(ball.position, 4 * np.linalg.norm(ends[-1] - ends[0]))
     assert not has_way(small, walls, 0.01, postures, replace(few, seconds=0.3))
