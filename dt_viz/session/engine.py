@@ -189,7 +189,8 @@ class Engine:
         learned = Learned.of(task, imitation, imitates=scenario.imitation)
         if isinstance(imitation, AugmentedImitation) and learned.poses and self.follower.unreached(learned):
             places = replace(imitation, goal_orientation=None, warnings=(*imitation.warnings, NOT_TURNED))
-            return Learned.of(task, places, imitates=scenario.imitation)
+            alone = Learned.of(task, places, imitates=scenario.imitation)
+            return learned if self.follower.unreached(alone) else alone
         return learned
 
     @kept(NEWEST, by=lambda task: task)

@@ -5,12 +5,16 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from dt_viz.files.recordings import Recordings
 from dt_viz.files.takes import Take
+from dt_viz.flows.rotations import quaternions
+from dt_viz.learning.augmented import fit_augmented
 from dt_viz.learning.demonstrations import Demonstration, DemonstrationError
 from dt_viz.learning.preparation import prepare
 from dt_viz.learning.store import FitStore
+from dt_viz.motion.nominal import Learned
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import TASKS, own_task
 from dt_viz.session.engine import MOST_OWN, NOT_TURNED, Engine
@@ -237,20 +241,26 @@ def test_undo_forgets_a_task_that_is_gone():
     assert history.undone(scenarios[-1]) == scenarios[0] and history.undone(scenarios[0]) is None
 
 
-def test_places_are_followed_where_the_arm_cannot_turn_its_hand_as_demonstrated(new_engine, monkeypatch):
-    along = np.linspace(0, 1, 80)[:, None]
-    begin, end = np.array([-0.25, -0.45, 0.15]), np.array([0.2, -0.45, 0.3])
-    upright = np.tile([1.0, 0.0, 0.0, 0.0], (80, 1))
-    takes = [
-        Demonstration(4 * along[:, 0], begin + shift + along * (end - begin - shift), str(k), upright)
-        for k, shift in enumerate(0.02 * np.random.default_rng(0).normal(size=(3, 3)))
-    ]
-    for can in (True, False):
-        engine = new_engine()
+def test_places_are_followed_where_the_arm_cannot_turn_its_hand_as_demonstrated(robot):
+    """Random tasks of an arm whose joints turn little: where turned hands are out of its reach and places are not."""
+    narrow = replace(robot, name="narrow", lower=robot.home - 1.2, upper=robot.home + 1.2)
+    engine, rng, along = Engine(TASKS, FitStore(None), narrow), np.random.default_rng(1), np.linspace(0, 1, 80)[:, None]
+    given_up = []
+    for _ in range(10):
+        begin, end = (
+            narrow.shoulder + narrow.reach * np.array([x, 0.1 * rng.normal() - 0.6, 0.1 * rng.normal() - 0.05])
+            for x in (-0.3, 0.3)
+        )
+        by = Rotation.from_rotvec(along * rng.normal(0, 1.5, 3))
+        turns = quaternions(Rotation.from_rotvec(rng.normal(0, 2, 3)) * by)
+        starts = begin + 0.02 * rng.normal(size=(3, 3))
+        takes = [Demonstration(4 * along[:, 0], start + along * (end - start), "take", turns) for start in starts]
         own, _ = engine.bring(own_task(tuple(takes)), "draw_s")
-        if not can:
-            monkeypatch.setattr(engine.follower, "unreached", lambda learned: ("the goal",) * bool(learned.poses))
-        nominal = engine.nominal(Scenario(own.name))
-        assert (nominal.orientations is not None) is can
-        assert (NOT_TURNED not in nominal.imitation.warnings) is can
-        assert engine.follower.undisturbed(nominal).tracked.error[:, [0, -1]].max() < 1e-3
+        learned = engine.nominal(Scenario(own.name)).learned
+        turned = Learned.of(own, fit_augmented(takes), imitates=True)
+        assert turned.poses is not None
+        given_up.append(learned.poses is None)
+        assert given_up[-1] is (NOT_TURNED in learned.imitation.warnings)
+        if given_up[-1]:
+            assert engine.follower.unreached(turned) and not engine.follower.unreached(learned)
+    assert 0 < sum(given_up) < 10
