@@ -177,7 +177,8 @@ def certified_map(
         by_hand: whether an integration was chosen by hand.
     """
     moved = np.flatnonzero((y != x).any(axis=1))
-    keep = _evenly(moved if len(moved) else np.arange(len(y)), num)
+    rows = moved if len(moved) else np.arange(len(y))
+    keep = rows[np.unique(np.linspace(0, len(rows) - 1, num).astype(int))]
     images, det = _quicker(transform).forward(y), np.linalg.det(transform.jacobian(y[keep])[1])
     off = images - x
     if by_hand:
@@ -216,11 +217,6 @@ def _quicker(transform: Diffeomorphism) -> Diffeomorphism:
     if isinstance(transform, Conjugated) and isinstance(transform.inner, AdaptiveFlow):
         return replace(transform, inner=replace(transform.inner, tolerance=POSTURE_TOLERANCE))
     return transform
-
-
-def _evenly(rows: Indices, num: int) -> Indices:
-    """At most `num` of the rows, evenly spread."""
-    return rows[np.unique(np.linspace(0, len(rows) - 1, num).astype(int))]
 
 
 def _longest(vectors: Array) -> float:

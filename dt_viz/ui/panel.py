@@ -57,19 +57,7 @@ class ControlPanel:
         darken: Callable[[bool], None],
         preview: Show = lambda _seen, _number: None,
     ) -> None:
-        """Build the controls; they act once `connect` has given them a session.
-
-        Args:
-            gui: controls of the visitor.
-            titles: titles of the tasks, by name.
-            robot: the first arm.
-            arms: titles of the arms that may be chosen, by their names.
-            save_png: makes a picture, given the resolution's name and whether it is transparent.
-            notify: shows a text in a colour beside the panel, however far that is scrolled.
-            tripod: stand of the visitor's camera.
-            darken: begins the dark theme, or the light one.
-            preview: shows takes that are open in the scene.
-        """
+        """Build the controls, for the titles of tasks and arms by name; they act once `connect` has given a session."""
         self._notify, self._tripod, self._titles = notify, tripod, dict(titles)
         self._notified: Message | None = None
         self._scenes = {scene.title: scene for scene in offered(self._titles)}
@@ -118,7 +106,7 @@ class ControlPanel:
     @property
     def legend(self) -> Legend | None:
         """Legend of the colours on the slice."""
-        return self.show.slice.legend
+        return self.show.legend
 
     def adopt(self, scenario: Scenario) -> None:
         """Show the scenario's choices."""

@@ -55,17 +55,7 @@ class PictureTab:
         enlarge: Callable[[bool], None],
         save_png: Callable[[str, bool], None],
     ) -> None:
-        """Build the controls where the panel is being built.
-
-        Args:
-            gui: controls of the visitor.
-            bindings: bindings of the visitor's panel.
-            tripod: stand of the visitor's camera.
-            presentation: the visitor's presentation.
-            darken: takes whether the theme is the dark one.
-            enlarge: takes whether the type is large.
-            save_png: makes a picture, given the resolution's name and whether it is transparent.
-        """
+        """Build the controls where the panel is being built; `save_png` takes a resolution, and whether transparent."""
         self._tripod = tripod
         gui.add_html(ROW)
         Control(gui.add_button_group("View", (*VIEWS, HAND, HOME)), tripod.view)
@@ -135,13 +125,7 @@ class Presentation:
     """Title and caption of what is shown, in place of the panel while it is on."""
 
     def __init__(self, gui: viser.GuiApi, turn: Callable[[int], None], present: Callable[[bool], None]) -> None:
-        """Build its controls where the panel is being built, hidden.
-
-        Args:
-            gui: controls of the visitor.
-            turn: goes so many scenes on, or back; must only submit.
-            present: called when the presentation begins, and when it ends.
-        """
+        """Build its controls where the panel is being built, hidden; `turn`, by so many scenes, must only submit."""
         self._panel, self._turn, self._present = gui.main_panel, turn, present
         self._title = self._caption = ""
         self._html = gui.add_html("", visible=False)

@@ -85,7 +85,8 @@ def concerns(frame: Frame, view: View) -> tuple[MotionWarning, ...]:
         why = " at this flow time" if scenario.avoids else ": nothing avoids it"
         found.append(MotionWarning(kind, f"the motions go through the obstacle{why}"))
     if scenario.avoids and scenario.arm_avoidance is None:
-        found = [_of_hand(warning) if warning.kind is Kind.ARM_ENTERS else warning for warning in found]
+        hand = "only the path of the hand gives way"
+        found = [replace(w, text=f"{w.text}: {hand}") if w.kind is Kind.ARM_ENTERS else w for w in found]
     return tuple(sorted(found, key=lambda warning: warning.kind.concern.gravity))
 
 
@@ -106,10 +107,6 @@ def _clearance_text(frame: Frame, view: View) -> str:
     return "no obstacle" if distance == float("inf") else f"{1e3 * distance:.0f} mm".replace("-", "−")
 
 
-def _of_hand(warning: MotionWarning) -> MotionWarning:
-    return replace(warning, text=f"{warning.text}: only the path of the hand gives way")
-
-
 @dataclass(frozen=True)
 class Remedy:
     """An edit that mends something."""
@@ -121,12 +118,7 @@ class Remedy:
 
 
 def remedy(frame: Frame, wanted: Scenario) -> Remedy | None:
-    """Return what mends the reason that matters most; None if nothing is known to, or the frame is of another motion.
-
-    Args:
-        frame: the newest frame.
-        wanted: the scenario that is wanted now, which the remedy changes.
-    """
+    """Return what mends the gravest problem of the newest frame; None if nothing does, or other motions are wanted."""
     if frame.blocked or frame.scenario.choices != wanted.choices:
         return None
     if wanted.warp < 1:
