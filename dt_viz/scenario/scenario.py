@@ -21,7 +21,13 @@ from dt_viz.scenario.slices import SlicePose
 
 SliceColour = Literal["none", "det", "lyapunov", "occupancy"]
 """Quantity shown as colour on the slice: det J of the stack, its Lyapunov value, or the learned occupancy."""
-SLICE_COLOURS: tuple[SliceColour, ...] = ("none", "det", "lyapunov", "occupancy")
+SLICE_COLOURS: Mapping[SliceColour, str] = {
+    "none": "None",
+    "det": "det J",
+    "lyapunov": "Lyapunov value",
+    "occupancy": "Learned occupancy",
+}
+"""Colours of the slice, with their names on the page."""
 
 MIN_DIAMETER, MAX_DIAMETER = 0.04, 0.30
 """Smallest and largest diameter of an obstacle, metres."""

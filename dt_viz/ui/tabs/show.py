@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import viser
 
-from dt_viz.scenario.scenario import OFFERS, SLICE_COLOURS, Scenario, SliceColour
+from dt_viz.scenario.scenario import OFFERS, SLICE_COLOURS, Scenario
 from dt_viz.scenario.stack import side_by_side
 from dt_viz.session.frame import Frame
 from dt_viz.session.session import Session
@@ -15,13 +14,6 @@ from dt_viz.ui.bindings import KEEP, Bindings
 from dt_viz.ui.scene.legend import OCCUPANCY, Legend, legend_of
 from dt_viz.ui.tabs.plots import HealthPlots, JointPlots, small
 
-COLOUR_LABELS: Mapping[SliceColour, str] = {
-    "none": "None",
-    "det": "det J",
-    "lyapunov": "Lyapunov value",
-    "occupancy": "Learned occupancy",
-}
-assert set(COLOUR_LABELS) == set(SLICE_COLOURS)
 WHOLE_ARM_NOTE = "The slice shows the stack of the hand's path; what the whole arm avoids with is not in it."
 IN_SCENE = (
     "rollouts",
@@ -74,9 +66,9 @@ class ShowTab:
         bindings.checkbox(gui, "move_slice")
         self.back = gui.add_button("Back to the task's slice", visible=False)
         bindings.on(self.back, _put_back, visible=lambda s: s.view.slice is not None)
-        names = {label: name for name, label in COLOUR_LABELS.items()}
+        names = {label: name for name, label in SLICE_COLOURS.items()}
         colour = gui.add_dropdown(OFFERS["colour"].label, tuple(names), hint=OFFERS["colour"].hint)
-        bindings.view(colour, "colour", COLOUR_LABELS.__getitem__, names.__getitem__)
+        bindings.view(colour, "colour", SLICE_COLOURS.__getitem__, names.__getitem__)
         of_phase = {
             "visible": lambda _s: bindings.frame is not None and bindings.frame.remembers,
             "disabled": lambda s: not _shows_velocities(s),

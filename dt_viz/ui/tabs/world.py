@@ -22,7 +22,6 @@ from dt_viz.scenario.scenario import MAX_DIAMETER, MAX_MARGIN, MAX_OBSTACLES, MI
 from dt_viz.scenario.stack import added, selected, surroundings, with_added, with_avoidance, without
 from dt_viz.scenario.starts import followed, label_of, with_grid, with_label
 from dt_viz.scenario.tasks import Task
-from dt_viz.session.frame import Frame
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import KEEP, Bindings
 from dt_viz.ui.tabs.from_file import ORIGIN, FileLoader, has_room
@@ -247,18 +246,36 @@ def add_starts(gui: viser.GuiApi, bindings: Bindings) -> None:
     """Build the folder "Starts": adds starts by clicks and in a grid, labels and removes them."""
     with gui.add_folder("Starts", expand_by_default=False):
         bindings.checkbox(gui, "click_to_start")
-        labels = partial(_labels, bindings)
-        bindings.input(
-            gui.add_dropdown("Label", (NEAREST,), initial_value=NEAREST, hint=LABEL_HINT),
-            lambda s: _label_shown(s, bindings.frame),
-            lambda s, name: _labelled(s, bindings.session.task, labels().get(name)),
-            options=lambda _s: (NEAREST, *labels()),
-            visible=lambda _s: bool(labels()),
-        )
+        _add_label(gui, bindings)
         acts = {"Grid": add_grid, "Remove": remove_start, "Clear": clear_starts}
         hint = "Grid: starts all over the slice. Remove: the start that the arm follows, or else the newest"
         buttons = gui.add_button_group("Starts", tuple(acts), hint=hint)
         bindings.later(buttons, lambda session, name: acts[name](session))
+
+
+def _add_label(gui: viser.GuiApi, bindings: Bindings) -> None:
+    """Build the choice of the label that new starts, and the added start that the arm follows, get."""
+
+    def names() -> dict[float | None, str]:
+        labels = () if bindings.frame is None else bindings.frame.labels
+        return {None: NEAREST} | {label: _named(label, labels) for label in sorted(set(labels))}
+
+    def shown(scenario: Scenario) -> str:
+        label = None if bindings.frame is None else label_of(scenario, bindings.frame.task)
+        return names().get(label, NEAREST)
+
+    def changed(scenario: Scenario, name: str) -> dict[str, Any]:
+        label = next((label for label, known in names().items() if known == name), None)
+        starts = with_label(scenario, bindings.session.task, label)
+        return {"starts": starts, "view": replace(scenario.view, start_label=label)}
+
+    bindings.input(
+        gui.add_dropdown("Label", (NEAREST,), initial_value=NEAREST, hint=LABEL_HINT),
+        shown,
+        changed,
+        options=lambda _s: tuple(names().values()),
+        visible=lambda _s: len(names()) > 1,
+    )
 
 
 def add_grid(session: Session) -> None:
@@ -296,28 +313,6 @@ def clear_starts(session: Session) -> None:
     """Remove all added starts."""
     place = followed(session.scenario, session.task)
     session.step("clear starts", starts=(), arm_rollout=place if place < len(session.task.starts) else 0)
-
-
-def _labelled(scenario: Scenario, task: Task, label: float | None) -> dict[str, Any]:
-    """What changes when new starts, and the added start that the arm follows, get a label."""
-    starts = with_label(scenario, task, label)
-    return {"starts": starts, "view": replace(scenario.view, start_label=label)}
-
-
-def _labels(bindings: Bindings) -> dict[str, float]:
-    """The labels of the frame that is shown, by their names."""
-    if bindings.frame is None:
-        return {}
-    labels = bindings.frame.labels
-    return {_named(label, labels): label for label in sorted(set(labels))}
-
-
-def _label_shown(scenario: Scenario, frame: Frame | None) -> str:
-    """The name of the label that starts of the scenario have in a frame."""
-    if frame is None:
-        return NEAREST
-    label = label_of(scenario, frame.task)
-    return NEAREST if label is None or label not in frame.labels else _named(label, frame.labels)
 
 
 def _named(label: float, labels: Sequence[float]) -> str:
