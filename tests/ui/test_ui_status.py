@@ -26,8 +26,25 @@ from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.jobs import Jobs
 from dt_viz.session.progress import Message, Pace, Progress
 from dt_viz.session.session import Session
-from dt_viz.ui.tabs.status import BUTTON, CHANGED, HINT, LEADING, PALE, REASON, details_html, hint, hint_html
-from dt_viz.ui.tabs.verdict import COMPUTING, FAILED, HOLDS, WARP_HINT, Verdict, concerns, remedy, verdict
+from dt_viz.ui.tabs.status import (
+    BUTTON,
+    CHANGED,
+    COMPUTING,
+    FAILED,
+    HINT,
+    HOLDS,
+    LEADING,
+    PALE,
+    REASON,
+    WARP_HINT,
+    Verdict,
+    concerns,
+    details_html,
+    hint,
+    hint_html,
+    remedy,
+    verdict,
+)
 from dt_viz.warning import ARM, Concern, Kind, MotionWarning, Severity
 
 PACE = Pace(0.02, 10.0, 0)
