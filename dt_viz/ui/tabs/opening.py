@@ -187,10 +187,9 @@ class OpenPanel:
             UnwantedError: the visitor has left, or has closed what was open.
         """
         opened, session, self.upload.disabled = self._opened, self._bindings.session, True
-        wait = "Another visitor's file is being read; yours is read after it."
         unwanted = lambda: session.jobs.closed or not self.folder.visible  # noqa: E731
         try:
-            with turn(partial(session.say, wait, Severity.WARNING), unwanted):
+            with turn(session.say, unwanted):
                 known = opening.read(opened.files, opened.answers, session.robot, unwanted)
             opening.preview(known, opened.choices, session.robot)
             if len(opened.files) > opened.num_read and len(known.takes) <= len(opened.recordings.takes):
