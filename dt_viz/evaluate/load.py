@@ -158,7 +158,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run the command; 1 if a visitor had no picture in time, was lost, or was not shown its last edit."""
     _, task = chosen_task(options)
-    out = None if options.out is None else ready_to_write(options.out, ".json")
+    out = None if options.out is None else ready_to_write(options.out, "FILE.json")
     unit = unit_ms()
     print(f"{task.name}; a fixed piece of numpy work takes {unit:.1f} ms")
     visits = []

@@ -18,7 +18,6 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import cycle
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,7 +33,6 @@ from dt_viz.evaluate.options import (
     chosen_task,
     new_engine,
     positive_number,
-    ready_to_write,
     report,
     whole_number,
     write_npz,
@@ -47,6 +45,8 @@ from dt_viz.motion.stack import LIVE
 from dt_viz.obstacles.shapes import UPRIGHT, Box, Obstacle, Quaternion, Sphere, as_point, as_quaternion
 from dt_viz.robot.robot import Robot
 from dt_viz.session.engine import Engine
+
+OUT = "FILE.npz"
 
 
 @dataclass(frozen=True)
@@ -314,13 +314,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--boxes", action="store_true", help="boxes of D × 0.8 D × 0.6 D, turned, not spheres")
     parser.add_argument("--diameter", type=positive_number("metres", 1), default=0.15, metavar="D", help="metres")
     parser.add_argument("--margin", type=positive_number("metres", 1), default=0.03, metavar="M", help="metres")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE.npz")
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the subcommand."""
     tasks, task = chosen_task(options)
-    out = ready_to_write(options.out, ".npz")
+    out = options.out
     bench = Bench(new_engine(tasks), task.name, options.diameter, options.margin, boxes=options.boxes)
     arrays: dict[str, Any] = {"diameter": options.diameter}
     figures: list[RunFigures] = []

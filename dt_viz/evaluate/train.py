@@ -25,7 +25,7 @@ from dt_viz.baselines.base import INSTALL, NotFittedError, Problem
 from dt_viz.baselines.registry import TRAINED, problem_of
 from dt_viz.baselines.weights import save_weights, weights_file
 from dt_viz.evaluate.held_out import folds_of, frechet
-from dt_viz.evaluate.options import InputError, ready_folder, report, whole_number
+from dt_viz.evaluate.options import FOLDER, InputError, report, whole_number
 from dt_viz.folders import default_cache_folder
 from dt_viz.learning.store import FitStore
 from dt_viz.motion.following import Follower
@@ -33,6 +33,8 @@ from dt_viz.motion.nominal import Learned
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.tasks import TASKS, Task, lasa_tasks
+
+OUT = FOLDER
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--epochs", type=whole_number(1), help="(default: the method's)")
     parser.add_argument("--folds", type=whole_number(2), metavar="N", help="hold out in so many folds (default: none)")
     parser.add_argument("--seed", type=whole_number(0), default=0, help="of what is random (default: %(default)s)")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the weights")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -81,7 +82,7 @@ def run(options: argparse.Namespace) -> int:
     alone = [name for name in names if len(tasks[name]().demonstrations) == 1]
     if options.folds and alone:
         raise InputError("--folds", f"one demonstration only in {', '.join(alone)}", "two or more in each")
-    folder = ready_folder(options.out)
+    folder = options.out
     fits, follower = FitStore(default_cache_folder()), Follower(load_jaco())
     rows: list[FitRow] = []
     for name in names:
@@ -109,7 +110,7 @@ def _splits(num: int, folds: int | None, folder: Path) -> list[Split]:
     if folds is None:
         return [Split(range(num), range(num), folder)]
     return [
-        Split([i for i in range(num) if i not in held], held, ready_folder(folder / f"fold_{k}"))
+        Split([i for i in range(num) if i not in held], held, folder / f"fold_{k}")
         for k, held in enumerate(folds_of(num, min(folds, num)))
     ]
 
@@ -128,6 +129,7 @@ def _row(
     train = import_module(trained.training).train
     seconds, sizes, distances = [], [], []
     for split, problem in zip(splits, problems, strict=True):
+        split.folder.mkdir(exist_ok=True)
         began = time.process_time()
         arrays = train(
             problem, num_epochs, lambda line: print(f"{method}, {task.name}: {line}", flush=True), options.seed

@@ -21,7 +21,6 @@ import argparse
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -37,7 +36,6 @@ from dt_viz.evaluate.options import (
     chosen_task,
     new_engine,
     number,
-    ready_to_write,
     report,
     whole_number,
     write_json,
@@ -55,6 +53,7 @@ from dt_viz.scenario.stack import plane_of
 from dt_viz.scenario.tasks import Task
 from tests.oracles import stepped as in_steps
 
+OUT = "FILE.json"
 NUM_ROLLOUTS, NUM_POINTS = 8, 200
 FINER = 1e-4
 """Tolerance of the truth, relative to the required accuracy."""
@@ -93,13 +92,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--count", type=whole_number(1), default=10_000, help="random starts (default: %(default)s)")
     parser.add_argument("--stepped", type=whole_number(0), default=500, help="of these (default: %(default)s)")
     parser.add_argument("--seed", type=whole_number(0), default=0, help="of the starts (default: %(default)s)")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE.json")
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the command; 1 if a side cannot be made accurate enough, a motion does not arrive or departs."""
     tasks, task = chosen_task(options)
-    out, fine, figures = ready_to_write(options.out, ".json"), True, {}
+    out, fine, figures = options.out, True, {}
     learned = new_engine(tasks).nominal(Scenario(task.name, state="plain")).learned
     for part in options.parts:
         rows, part_is_fine = PARTS[part](task, learned, options)

@@ -23,7 +23,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -37,7 +36,6 @@ from dt_viz.evaluate.options import (
     chosen_task,
     new_engine,
     positive_number,
-    ready_to_write,
     report,
     unit_ms,
     whole_number,
@@ -55,6 +53,7 @@ from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.progress import Display, Pace, Progress
 from dt_viz.session.session import Session
 
+OUT = "FILE.json"
 EDITS_PER_SECOND = 60
 WARM_UP_SECONDS = 1.0
 
@@ -124,13 +123,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--shape", choices=tuple(SHAPES), default="sphere", help="of these (default: %(default)s)")
     parser.add_argument("--seconds", type=positive_number("seconds", 3600), required=True, help="to measure")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE.json")
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the command; 1 if the session reported an error."""
     tasks, task = chosen_task(options)
-    out = ready_to_write(options.out, ".json")
+    out = options.out
     scenario, shown = _scenario(task, options), Recorder()
     engine = _timed(new_engine(tasks), shown)
     engine.nominal(scenario)  # learned before
