@@ -51,6 +51,7 @@ def run_command(package: str, commands: Sequence[str], arguments: Sequence[str],
     from dt_viz.errors import DataError  # noqa: PLC0415
     from dt_viz.evaluate.options import (  # noqa: PLC0415
         PRINTED,
+        TABLES,
         InputError,
         ready_to_write,
         with_negative_values,
@@ -66,14 +67,15 @@ def run_command(package: str, commands: Sequence[str], arguments: Sequence[str],
         subparser = subparsers.add_parser(name, help=summary, description=summary)
         module.add_arguments(subparser)
         out = getattr(module, "OUT", None)
-        if out is not None:
+        if out is not None and out != TABLES:
             subparser.add_argument("--out", type=Path, required=True, metavar=out, help="what is written")
-        subparser.add_argument("--tables", type=Path, metavar="FILE.json", help="also write what is printed in tables")
+        names = ("--tables",) if out != TABLES else ("--out", "--tables")
+        subparser.add_argument(*names, type=Path, dest="tables", metavar="FILE.json", help="also write what is printed")
         subparser.set_defaults(run=module.run, form=out)
     options = parser.parse_args(with_negative_values(arguments))
     PRINTED.clear()
     try:
-        if options.form is not None:
+        if options.form not in (None, TABLES):
             ready_to_write(options.out, options.form)
         tables = None if options.tables is None else ready_to_write(options.tables, "FILE.json")
         status = options.run(options)

@@ -27,6 +27,8 @@ Row = Mapping[str, str | float | None]
 """Row of a table: text or number of each column by its header, which names the unit."""
 FOLDER = "DIR"
 """What a command's `OUT` is where it writes several files."""
+TABLES = "TABLES"
+"""What a command's `OUT` is where it writes nothing but what it prints."""
 PRINTED: list[Sequence[Row]] = []
 """Tables that the running command has printed."""
 

@@ -30,6 +30,7 @@ from dt_viz.avoidance.hand import Avoidance
 from dt_viz.avoidance.transform import Transform
 from dt_viz.evaluate.held_out import arrival_times
 from dt_viz.evaluate.options import (
+    TABLES,
     Row,
     add_task,
     avoiding,
@@ -38,7 +39,6 @@ from dt_viz.evaluate.options import (
     number,
     report,
     whole_number,
-    write_json,
 )
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain
 from dt_viz.flows.fields import Array
@@ -53,7 +53,7 @@ from dt_viz.scenario.stack import plane_of
 from dt_viz.scenario.tasks import Task
 from tests.oracles import stepped as in_steps
 
-OUT = "FILE.json"
+OUT = TABLES
 NUM_ROLLOUTS, NUM_POINTS = 8, 200
 FINER = 1e-4
 """Tolerance of the truth, relative to the required accuracy."""
@@ -97,14 +97,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run the command; 1 if a side cannot be made accurate enough, a motion does not arrive or departs."""
     tasks, task = chosen_task(options)
-    out, fine, figures = options.out, True, {}
+    fine = True
     learned = new_engine(tasks).nominal(Scenario(task.name, state="plain")).learned
     for part in options.parts:
         rows, part_is_fine = PARTS[part](task, learned, options)
         print(f"{task.name}, {part}")
         report(rows)
-        figures[part], fine = rows, fine and part_is_fine
-    write_json(out, {**figures, "settings": {"task": task.name, "accuracy": options.accuracy}})
+        fine = fine and part_is_fine
     return 0 if fine else 1
 
 

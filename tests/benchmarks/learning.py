@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from dt_viz.evaluate.held_out import NUM_COMPARED, frechet, shifted_to
-from dt_viz.evaluate.options import Row, report, write_json
+from dt_viz.evaluate.options import TABLES, Row, report
 from dt_viz.flows.fields import Array
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.demonstrations import Demonstration, load_demonstrations
@@ -23,7 +23,7 @@ from dt_viz.learning.interface import AnyImitation
 from dt_viz.learning.state import learn
 from dt_viz.metrics import resample_by_arc_length
 
-OUT = "FILE.json"
+OUT = TABLES
 AWAY = (0.25, 0.5)
 """Distances of starts from the mean one, relative to the extent of the demonstrations."""
 PUSH, DRAWN = 0.2, 0.05
@@ -51,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run the command."""
-    out, found = options.out, []
+    found = []
     for path in options.files:
         demonstrations = load_demonstrations(path)
         found.append(off_course(path.stem, demonstrations, learn(demonstrations, state=options.state)))
@@ -68,7 +68,6 @@ def run(options: argparse.Namespace) -> int:
     for name, of in (("mean", np.mean), ("largest", np.max), ("smallest", np.min)):
         rows.append({"shape": name, **{column: float(of(values)) for column, values in numbers.items()}})
     report(rows)
-    write_json(out, {"state": options.state, "shapes": rows})
     return 0
 
 
