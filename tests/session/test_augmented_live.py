@@ -13,7 +13,6 @@ import dt_viz as dt
 from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.control.controller import ArmController, Phase
 from dt_viz.errors import DataError, FormatError
-from dt_viz.evaluate.held_out import path_from
 from dt_viz.learning.augmented import fit_augmented
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.imitation import ImitationSettings
@@ -29,6 +28,7 @@ from dt_viz.scenario.scenario import Scenario, Start
 from dt_viz.scenario.tasks import TASKS, TaskEntry, drawing_task
 from dt_viz.session.frame import Stage
 from dt_viz.warning import Kind
+from tests.benchmarks.learning import path_from
 
 EIGHT = "draw_8"
 TICK = 0.01
