@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 import time
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -84,9 +84,8 @@ class FrameWithoutMotion(Frame):
     reason: Any = ""
     labels: Any = ()
     learned_steps: Any = ()
-    durations: Any = ()
-    chosen_values: Any = ()
-    arm_duration: Any = None
+    durations: Any = field(default_factory=dict)
+    chosen_values: Any = field(default_factory=dict)
 
 
 def frame_of(scenario: Scenario, **changes: Any) -> Frame:

@@ -184,7 +184,6 @@ class Engine:
 
     @kept(NEWEST, by=lambda task: task)
     def _augmented(self, task: str) -> AugmentedImitation:
-        """The augmented imitation of a task's demonstrations."""
         of = self.task(task)
         return fit_augmented(of.demonstrations, settings=AugmentedSettings(preparation=of.preparation))
 
@@ -345,6 +344,5 @@ class Engine:
 
 
 def _without_obstacles(stack: tuple[Layer, ...]) -> tuple[Layer, ...]:
-    """The stack with all that avoids switched off."""
     avoids = [isinstance(layer.transform, Avoidance) or bool(layer.transform.avoided.parts) for layer in stack]
     return tuple(replace(layer, on=layer.on and not off) for layer, off in zip(stack, avoids, strict=True))

@@ -293,12 +293,10 @@ class Session:
         self._adopt()
 
     def _adopt(self) -> None:
-        """Show the newest scenario on the controls."""
         self._unadopted = False
         self._screen.adopt(lambda: self.scenario)
 
     def _catch_up(self) -> None:
-        """Show what a drag has edited."""
         if self._unadopted:
             self._adopt()
 

@@ -26,7 +26,7 @@ SCENARIO = avoiding("draw_s", Sphere((0.0, -0.5, 0.4)), layers=biases(BiasPoint(
 
 def frame(scenario=SCENARIO, **changes):
     given: dict[str, Any] = {
-        "chosen_values": ({"strength": 0.8, "radius": 0.2}, {"duration": 0.4}),
+        "chosen_values": {"Bias 1": {"strength": 0.8, "radius": 0.2}, AVOIDANCE: {"duration": 0.4}},
         "learned_steps": (4, 4, 4),
         "task": TASKS[scenario.task](),
     }

@@ -229,7 +229,6 @@ class OpenPanel:
                 self._draw()
 
     def _choose(self, change: Callable[[Choices], Mapping[str, Any]]) -> None:
-        """Have choices changed."""
         with self._changing:
             choices = self._opened.choices
             self._opened = replace(self._opened, choices=replace(choices, **change(choices)))
@@ -248,7 +247,6 @@ class OpenPanel:
 
     @property
     def _number(self) -> int:
-        """Number of the take that is chosen."""
         options = self.controls["take"].handle.options
         value = self.controls["take"].value
         return options.index(value) if value in options else 0
@@ -272,7 +270,6 @@ class OpenPanel:
     # --- what is shown ---
 
     def _draw(self) -> None:
-        """Show what is open."""
         seen, opened = self._seen, self._opened
         self.controls["learn"].handle.disabled = seen is None or seen.task is None
         if seen is None:
@@ -316,7 +313,6 @@ class OpenPanel:
         control.handle.visible = bool(options)
 
     def _turn(self, name: str, on: bool, *, shown: bool) -> None:
-        """Show a checkbox, or hide it."""
         self.controls[name].value, self.controls[name].handle.visible = on, shown
 
 

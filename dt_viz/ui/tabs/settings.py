@@ -13,8 +13,7 @@ from dt_viz.avoidance.page import Choice, FlowIntegration, Number, PageEntry, Se
 from dt_viz.avoidance.transform import Transform
 from dt_viz.flows.diffeomorphisms import MAX_STEPS, Method
 from dt_viz.scenario.scenario import Scenario
-from dt_viz.scenario.stack import WHOLE_ARM, transform_of, with_transform
-from dt_viz.session.frame import Frame
+from dt_viz.scenario.stack import transform_of, with_transform
 from dt_viz.ui.bindings import KEEP, Bindings
 from dt_viz.ui.controls import Control
 
@@ -39,14 +38,6 @@ def settings_of_purpose(kind: PageEntry) -> tuple[Setting, ...]:
         for setting in kind.settings
         if isinstance(setting, Switch) or (isinstance(setting, Number) and not setting.of_flow)
     )
-
-
-def chosen_values(frame: Frame) -> dict[str, Mapping[str, float]]:
-    """Return the values that each transform chose automatically, by its name and its fields."""
-    values = {layer.name: chosen for layer, chosen in zip(frame.scenario.stack, frame.chosen_values, strict=False)}
-    if frame.arm_duration is not None:
-        values[WHOLE_ARM] = {"duration": frame.arm_duration}
-    return values
 
 
 @dataclass(frozen=True)
@@ -100,7 +91,7 @@ class _SettingField:
         """Return the value that the chosen transform chose automatically, if it is known."""
         scenario, frame = self.bindings.scenario, self.bindings.frame
         name = None if scenario is None else self.chosen(scenario)
-        return None if name is None or frame is None else chosen_values(frame).get(name, {}).get(self.setting.field)
+        return None if name is None or frame is None else frame.chosen_values.get(name, {}).get(self.setting.field)
 
     def add(self, given: dict[str, Any]) -> None:
         """Build its controls where the panel is being built, with the options of viser that are given."""

@@ -13,7 +13,14 @@ from dt_viz.avoidance.registry import entry_of
 from dt_viz.robot.collision import SELF_REACH, CollisionReport
 from dt_viz.scenario.paper_scenes import SCENES
 from dt_viz.scenario.scenario import Scenario, View
-from dt_viz.scenario.stack import avoidance_layer, avoiding_with, transform_of, with_avoidance, with_transform
+from dt_viz.scenario.stack import (
+    WHOLE_ARM,
+    avoidance_layer,
+    avoiding_with,
+    transform_of,
+    with_avoidance,
+    with_transform,
+)
 from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.progress import Pace, Progress
 from dt_viz.session.session import Session
@@ -100,7 +107,6 @@ def verdict(progress: Progress) -> Verdict:
 
 
 def _judged(frame: Frame, found: tuple[MotionWarning, ...]) -> tuple[str, Severity, str]:
-    """Return the head of the line, the severity, and the reason."""
     if frame.blocked:
         why = "; ".join(map(str, frame.blocked))
         return "✕ no motion", Severity.ALARM, f"{why}. What is shown is the last good motion."
@@ -245,7 +251,6 @@ def details_html(frame: Frame, pace: Pace, view: View) -> str:
 
 
 def _boxes(warnings: tuple[MotionWarning, ...], severity: Severity) -> str:
-    """Return warnings in boxes of their colour."""
     colour, background = COLOURS[severity]
     return "".join(
         "<div style='font-size:0.8em;margin:0.2em 0.9em 0.5em;padding:0.35em 0.6em;"
@@ -285,15 +290,12 @@ def error_text(length: float) -> str:
 
 def _duration_rows(frame: Frame, off: str) -> Iterator[tuple[str, str]]:
     """Yield the rows with t of the flows: of the avoidance, and of the transforms that call it otherwise."""
-    hand, strengths = None, []
-    for layer, duration in zip(frame.scenario.stack, frame.durations, strict=False):
-        if duration is None:
-            continue
-        if entry_of(layer.transform).most == 1:
-            hand = duration
-        else:
-            strengths.append(f"{duration:.2f} {layer.name}")
-    flow_time = hand if frame.arm_duration is None else frame.arm_duration
+    strengths, times, flow_time = [], frame.durations, frame.durations.get(WHOLE_ARM)
+    for layer in frame.scenario.stack:
+        if layer.name in times and entry_of(layer.transform).most > 1:
+            strengths.append(f"{times[layer.name]:.2f} {layer.name}")
+        elif flow_time is None:
+            flow_time = times.get(layer.name)
     if flow_time is not None or not strengths:
         yield "Flow time t", off if flow_time is None else f"{flow_time:.2f}"
     if strengths:
