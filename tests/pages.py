@@ -131,7 +131,7 @@ def panel_of(server: viser.ViserServer, notify: Any = ignored) -> ControlPanel:
 class NoFrames:
     """An engine that has no frames: nothing here is about motions."""
 
-    bring, adopt = Engine.bring, Engine.adopt
+    bring = Engine.bring
 
     def __init__(self, robot=None):
         self.follower = Follower(robot or load_jaco())

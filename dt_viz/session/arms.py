@@ -12,8 +12,7 @@ from dt_viz.robot.descriptions import local_descriptions
 from dt_viz.robot.making import load_aside
 from dt_viz.robot.models import ARMS, NUM_LOADED
 from dt_viz.robot.robot import Robot
-from dt_viz.scenario.scenario import Scenario
-from dt_viz.scenario.tasks import Task, TaskEntry
+from dt_viz.scenario.tasks import TaskEntry
 from dt_viz.session.engine import Engine
 from dt_viz.session.tasks_in_reach import in_reach
 
@@ -75,16 +74,7 @@ class Engines:
             if arm in self._known:
                 engine = self._known[arm]  # the first of two that were made at once
             else:
-                engine.adopt(next(iter(self._known.values())).own)
+                engine.own = next(iter(self._known.values())).own
             others = [(name, known) for name, known in self._known.items() if name != arm]
             self._known = dict([*others[-1:], (arm, engine)])
         return engine
-
-    def bring(self, task: Task, scenario: Scenario) -> tuple[Task, str | None]:
-        """Take a task of the visitor's own, whatever the arm; see `Engine.bring`."""
-        engine = self(scenario.arm)
-        brought = engine.bring(task, scenario.task)
-        with self._lock:
-            for other in self._known.values():
-                other.adopt(engine.own)
-        return brought

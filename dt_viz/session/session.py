@@ -160,7 +160,7 @@ class Session:
 
     def bring(self, task: Task) -> tuple[Task, str | None]:
         """Take a task of the visitor's own, to be chosen; see `Engine.bring`."""
-        own, gone = self.engines.bring(task, self.scenario)
+        own, gone = self.engine.bring(task, self.scenario.task)
         if gone is not None:
             with self._lock:
                 self._history.forget(gone)

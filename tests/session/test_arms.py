@@ -46,7 +46,7 @@ class Sketch:
 class Sketches:
     """An engine whose frames are empty."""
 
-    bring, adopt = Engine.bring, Engine.adopt
+    bring = Engine.bring
 
     def __init__(self, robot, tasks=TASKS):
         self.follower, self.tasks, self.seen = Follower(robot), tasks, []
