@@ -14,7 +14,7 @@ from dt_viz.avoidance.transform import Transform
 from dt_viz.flows.diffeomorphisms import MAX_STEPS, Method
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import transform_of, with_transform
-from dt_viz.ui.bindings import KEEP, Bindings
+from dt_viz.ui.bindings import KEEP, Bindings, Handle, Read, Value
 from dt_viz.ui.controls import Control
 
 Chosen = Callable[[Scenario], str | None]
@@ -56,10 +56,10 @@ class _SettingField:
         transform = None if name is None else transform_of(scenario, name)
         return transform if transform and self.setting in self.offered(registry.entry_of(transform)) else None
 
-    def read(self, of_value: Callable[[Any], Any], otherwise: Any) -> Callable[[Scenario], Any]:  # noqa: ANN401
+    def read(self, of_value: Callable[[Value], Value], otherwise: Value) -> Read:
         """Return a function of a scenario: `of_value` of the field, or `otherwise` where there is none."""
 
-        def read(scenario: Scenario) -> Any:  # noqa: ANN401
+        def read(scenario: Scenario) -> Value:
             transform = self.transform(scenario)
             return otherwise if transform is None else of_value(getattr(transform, self.setting.field))
 
@@ -67,25 +67,26 @@ class _SettingField:
 
     def bind(
         self,
-        handle: Any,  # noqa: ANN401
-        shown: Callable[[Any], Any],
-        meant: Callable[[Any, Any], Any],
-        visible: Callable[[Any], bool] = lambda _value: True,
+        handle: Handle,
+        shown: Callable[[Value], Value],
+        meant: Callable[[Value, Value], Value],
+        visible: Callable[[Value], bool] = lambda _value: True,
+        **properties: Read,
     ) -> Control:
         """Bind an input, visible where there is a field to be seen, to it.
 
         `shown` is the input's value for the field's, `meant` the field's for its old one and the input's.
         """
 
-        def change(scenario: Scenario, value: Any) -> Mapping[str, Any]:  # noqa: ANN401
+        def change(scenario: Scenario, value: Value) -> Mapping[str, Any]:
             name, transform = self.chosen(scenario), self.transform(scenario)
             if name is None or transform is None:
                 return {}
             changed = {self.setting.field: meant(getattr(transform, self.setting.field), value)}
             return {"stack": with_transform(scenario, name, replace(transform, **changed))}
 
-        self.bindings.properties(handle, visible=self.read(visible, otherwise=False))
-        return self.bindings.input(handle, self.read(shown, otherwise=KEEP), change)
+        properties["visible"] = self.read(visible, otherwise=False)
+        return self.bindings.input(handle, self.read(shown, otherwise=KEEP), change, **properties)
 
     def suggestion(self) -> float | None:
         """Return the value that the chosen transform chose automatically, if it is known."""
@@ -131,8 +132,8 @@ class _SettingField:
             self.gui.add_slider(f"{setting.label} {setting.unit}", *limits, hint=hint, **given),
             shown,
             lambda before, number: None if before is None else number / setting.scale,
+            disabled=self.read(lambda value: value is None, otherwise=KEEP),
         )
-        self.bindings.properties(slider.handle, disabled=self.read(lambda value: value is None, otherwise=KEEP))
 
     def _add_integration(self, given: dict[str, Any]) -> None:
         hint = "auto: errors stay invisible; the others take equal steps, and the status warns of their errors"
