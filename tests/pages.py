@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 import time
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -84,14 +84,15 @@ class FrameWithoutMotion(Frame):
     reason: Any = ""
     labels: Any = ()
     learned_steps: Any = ()
-    durations: Any = field(default_factory=dict)
-    chosen_values: Any = field(default_factory=dict)
+    durations: Any = None
+    chosen_values: Any = None
 
 
 def frame_of(scenario: Scenario, **changes: Any) -> Frame:
     """The last frame of a scenario, with nothing in it but what is given."""
     nothing: Any = None
-    given = {"stage": Stage.CERTIFIED, "certificates": Certificates(0.01)} | changes
+    known = {"stage": Stage.CERTIFIED, "certificates": Certificates(0.01), "durations": {}, "chosen_values": {}}
+    given = known | changes
     given.setdefault("shaping", np.ones(len(changes.get("rollouts", ())), bool))
     return FrameWithoutMotion(scenario, motion=nothing, drawn=nothing, **given)
 
