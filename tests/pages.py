@@ -284,8 +284,8 @@ class Bound(Bindings):
         self.edited = Edited(scenario, self)
         self.connect(cast(Session, self.edited))
 
-    def input(self, handle: Any, read: Any, change: Any) -> Control:
-        control = super().input(handle, read, change)
+    def input(self, handle: Any, read: Any, change: Any, **properties: Any) -> Control:
+        control = super().input(handle, read, change, **properties)
         self._inputs.setdefault(handle.label, []).append(SimpleNamespace(control=control, read=read, change=change))
         return control
 

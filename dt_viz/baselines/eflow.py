@@ -231,10 +231,6 @@ class EFlowSystem:
         rate = self.scale * self.speed(self.normalised(y))
         return rate[:, None] * np.linalg.solve(J, descent[..., None])[..., 0]
 
-    def lyapunov(self, y: Array) -> Array:
-        """‖ψ(y) − ψ(y_e)‖ (N,), in the normalised unit."""
-        return np.linalg.norm(self.transform.forward(y) - self.latent_goal, axis=-1) / self.scale
-
     def rollouts(self, starts: Array, spacing: float) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
         """Motions to the goal, exact but for their times, whose integral is a sum of trapezia.
 

@@ -130,7 +130,7 @@ class MPNetModel:
         return self.centre + self.scale * sums[-1][0]
 
 
-Replan = Callable[[Array, Array], list[Array]]
+Replan = Callable[["Search", Array, Array], list[Array]]
 """Plans a stretch between two postures (n,) again: its postures, both ends among them."""
 
 
@@ -181,20 +181,20 @@ class Search:
         ends = [way[0], *(q for q in way[1:-1] if self.free(q, q)), way[-1]]
         found = [ends[0]]
         for start, end in pairwise(ends):
-            found += [end] if self.free(start, end) else replan(start, end)[1:]
+            found += [end] if self.free(start, end) else replan(self, start, end)[1:]
         return found
 
     def is_free(self, way: list[Array]) -> bool:
         """Decide whether a whole way is free."""
         return all(self.free(*piece) for piece in pairwise(way))
 
-    def way(self, query: Query) -> list[Array]:
-        """Plan a motion; it may collide."""
+    def way(self, query: Query, replan: Replan | None) -> list[Array]:
+        """Plan a motion, in the end by `replan` where that is given; it may collide."""
         way = self.contracted(self.bidirectional(query.start, query.goal))
-        for _ in range(ARCHITECTURE.max_rounds):
+        for again in (*[Search.bidirectional] * ARCHITECTURE.max_rounds, *([replan] if replan else [])):
             if self.is_free(way):
                 break
-            way = self.contracted(self.replanned(way, self.bidirectional))
+            way = self.contracted(self.replanned(way, again))
         return way
 
 
@@ -204,6 +204,8 @@ class MPNetPlanner:
 
     problem: Problem
     model: MPNetModel
+    replan: Replan | None = None
+    """Plans again what the network finds no free way for."""
 
     def plan(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
         """Plan around an obstacle as far as that succeeds; see `Planner`."""
@@ -212,16 +214,12 @@ class MPNetPlanner:
         for number, start in enumerate(starts):
             query = Query.of(self.problem, start)
             search = Search(self.model, surroundings, np.random.default_rng(ARCHITECTURE.seed), cancelled)
-            way = self.way(search, query)
+            way = search.way(query, self.replan)
             if not search.is_free(way):
                 warnings.append(f"the motion from start {number + 1} collides: no free way was found")
             queries.append(query)
             ways.append(np.stack(way))
         return planned(self.problem, queries, ways, tuple(warnings))
-
-    def way(self, search: Search, query: Query) -> list[Array]:
-        """Plan one motion; it may collide."""
-        return search.way(query)
 
 
 class MPNet(Method):

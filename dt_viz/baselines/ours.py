@@ -59,16 +59,12 @@ class _WholeArmPlanner:
             UnreachableError: the arm cannot get to where the task's motions start.
         """
         nominal, places = from_starts(self.learned, starts)
-        moving = self._moving(nominal, obstacle)
-        motions = [moving[place] if place in moving else self._resting(nominal, place) for place in places]
-        end_effector = self.follower.robot.end_effector
-        return Plan(
-            tuple(end_effector(q) for q, _ in motions), tuple(t for _, t in motions), tuple(q for q, _ in motions)
-        )
-
-    def _resting(self, nominal: Nominal, place: int) -> tuple[Array, Array]:
-        """The posture (1, n), rad, at the start of a rollout, at time 0 (1,)."""
-        return self.follower.undisturbed(nominal).tracked.q[place, :1], np.zeros(1)
+        motions = self._moving(nominal, obstacle)
+        if stays := set(places) - set(motions):
+            q = self.follower.undisturbed(nominal).tracked.q
+            motions |= {place: (q[place, :1], np.zeros(1)) for place in stays}
+        joints, times = zip(*(motions[place] for place in places), strict=True)
+        return Plan(tuple(map(self.follower.robot.end_effector, joints)), times, joints)
 
     def _moving(self, nominal: Nominal, obstacle: Union) -> dict[int, tuple[Array, Array]]:
         """Joints (N, n), rad, and times (N,), s, of the rollouts that the arm finds a way for, by their place."""
@@ -81,11 +77,11 @@ class _WholeArmPlanner:
         arm = solved.arm
         if solved.blocked or arm is None:
             return {}
-        due, limits = solved.stack.rays.times(arm.index, arm.fraction), self.follower.robot.velocity_limits
-        rows = {place: arm.index == place for place in np.flatnonzero(solved.nominal.moving).tolist()}
-        return {
-            place: (arm.p[row], within_velocity_limits(due[row], arm.p[row], limits)) for place, row in rows.items()
-        }
+        due, limits, motions = solved.stack.rays.times(arm.index, arm.fraction), self.follower.robot.velocity_limits, {}
+        for place in np.flatnonzero(solved.nominal.moving).tolist():
+            q = arm.p[arm.index == place]
+            motions[place] = q, within_velocity_limits(due[arm.index == place], q, limits)
+        return motions
 
 
 class Ours(Method):

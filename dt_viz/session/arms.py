@@ -39,13 +39,7 @@ class ArmStore:
     """
 
     def __init__(self, tasks: Mapping[str, TaskEntry], fits: FitStore, first: Robot) -> None:
-        """Take what arms share.
-
-        Args:
-            tasks: by name, made for the JACO.
-            fits: what was learned before.
-            first: the arm that visitors begin with.
-        """
+        """Take tasks made for the JACO, by name, what was learned before, and the arm that visitors begin with."""
         self._tasks, self._fits, self._memo = tasks, fits, Memo()
         self._first = _Workplace(first, in_reach(tasks, first), Memo())
         known = {name: name for name in local_descriptions()} | {name: arm.title for name, arm in ARMS.items()}
@@ -54,11 +48,7 @@ class ArmStore:
         """Titles of the arms that may be chosen, by their names."""
 
     def engine(self, name: str = "", progress: Progress = lambda _fraction, _message: None) -> Engine:
-        """Make an engine for an arm.
-
-        Args:
-            name: of `titles`.
-            progress: is told how much of loading is done; it may raise an exception to cancel.
+        """Make an engine for an arm of `titles`; `progress` is told how much of it is loaded, and may raise to cancel.
 
         Raises:
             ArmError: its description cannot be used.

@@ -131,12 +131,9 @@ class Drawing:
 
     @kept(2, by=lambda frame, _, coarse: _seen(frame, coarse))
     def pictures(self, frame: Frame, others: Mapping[Panel, Learned], coarse: bool) -> Pictures:
-        """The pictures that the view of a frame shows, on its slice and of its level.
+        """The pictures that the view of a frame shows, on its slice and of its level, coarse where they follow a drag.
 
-        Args:
-            frame: its motion.
-            others: the learned motions that panels of other tasks show.
-            coarse: whether they are to follow a drag.
+        The `others` are the learned motions that panels of other tasks show.
         """
         motion, view, area = frame.motion, frame.scenario.view, frame.slice
         built = motion.stack.built[: frame.level]

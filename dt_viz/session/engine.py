@@ -53,14 +53,7 @@ class Engine:
     def __init__(
         self, tasks: Mapping[str, TaskEntry], fits: FitStore, robot: Robot, shared: Memo | None = None
     ) -> None:
-        """Take what engines share.
-
-        Args:
-            tasks: by name.
-            fits: what was learned before.
-            robot: the arm.
-            shared: what keeps the results that no visitor's edits change; None keeps them for this engine alone.
-        """
+        """Take what engines share: tasks, what was learned, the arm, and what no visitor's edits change, if any."""
         self._tasks = tasks
         self._fits = fits
         self.memo, self._shared = Memo(), Memo() if shared is None else shared
@@ -89,11 +82,7 @@ class Engine:
         return self.own[name][0] if name in self.own else self._tasks[name]()
 
     def bring(self, task: Task, shown: str) -> tuple[Task, str | None]:
-        """Take a task of the visitor's own.
-
-        Args:
-            task: the task.
-            shown: name of the task that is shown now, which stays.
+        """Take a task of the visitor's own, while another one is `shown`, which stays.
 
         Returns:
             The task with a name and a title of its own, and the name of the own task that had to go, if one had.
@@ -118,7 +107,7 @@ class Engine:
 
         Args:
             scenario: what to show.
-            progress: called while a task is fitted for the first time; see `dt_viz.learning.imitation.fit`.
+            progress: told how far learning is; see `dt_viz.learning.imitation.fit`.
             cancelled: asked after stage LIVE, before each part of the computation and while it waits for a slot.
 
         Raises:

@@ -56,16 +56,7 @@ class Visitor(Display):
         task: str,
         arms: ArmStore | None = None,
     ) -> None:
-        """Build the page and start computing.
-
-        Args:
-            client: connection of the visitor.
-            engine: engine of this visitor only.
-            robot: the first arm.
-            titles: titles of the tasks, by name.
-            task: name of the first task.
-            arms: arms to choose from; None is the first one alone.
-        """
+        """Build the page for an engine of its own and start computing; there is one arm where there are no `arms`."""
         self.client = client
         self.shown: Frame | None = None
         """The last drawn frame."""

@@ -112,7 +112,7 @@ class TestSearch:
     def test_only_colliding_stretches_are_planned_again(self):
         asked = []
 
-        def replan(a, b):
+        def replan(_, a, b):
             asked.append((a[0], b[0]))
             return at(a[0], 10, b[0])
 

@@ -63,7 +63,7 @@ def test_in_folds_each_demonstration_is_compared_with_what_was_learned_from_othe
 def test_a_single_demonstration_cannot_be_held_out(monkeypatch, tmp_path, capsys):
     task = TASKS["draw_s"]()
     alone = replace(task, demonstrations=task.demonstrations[:1])
-    monkeypatch.setattr(train, "TASKS", {"draw_s": lambda: alone})
+    monkeypatch.setattr(train, "known_tasks", lambda _: {"draw_s": lambda: alone})
     assert main([*COMMAND, "--folds", "3", "--out", str(tmp_path)]) == 2
     assert "--folds: found one demonstration only in draw_s" in capsys.readouterr().err
 

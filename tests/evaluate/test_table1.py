@@ -153,10 +153,11 @@ def test_paths_of_the_hand_are_tracked_by_the_arm(problem):
 def test_a_motion_that_stays_at_its_start_is_measured(problem):
     x, q = problem.task.paths[0][:1], problem.postures[0][:1]
     nowhere = Union((Sphere((5.0, 0.0, 0.0), 0.15),))
-    found = table1.measure(problem.robot, x, np.zeros(1), q, problem.task.paths[0], problem.learned.goal, nowhere)
-    assert found.frechet == pytest.approx(np.linalg.norm(problem.task.paths[0] - x, axis=1).max(), rel=1e-4)
-    assert found.goal_error == pytest.approx(np.linalg.norm(problem.learned.goal - x[0]))
-    assert found.hand_depth == found.turn == found.jerk == 0
+    measured = table1.measure(problem, x, np.zeros(1), q, problem.task.paths[0], nowhere)
+    found = dict(zip(table1.OF_MOTIONS, measured, strict=True))
+    assert found["frechet"] == pytest.approx(np.linalg.norm(problem.task.paths[0] - x, axis=1).max(), rel=1e-4)
+    assert found["goal_error"] == pytest.approx(np.linalg.norm(problem.learned.goal - x[0]))
+    assert found["hand_depth"] == found["turn"] == found["jerk"] == 0
 
 
 class TestMissing:

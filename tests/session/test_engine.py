@@ -211,13 +211,6 @@ def test_a_motion_either_clears_the_obstacle_or_that_is_said(engine, scenario, g
     assert (depth(frame) == 0) != bool(frame.certificates.warnings)
 
 
-def test_an_edit_of_the_view_gives_the_same_motion(engine, scenario):
-    seen = frame_at(engine, scenario, Stage.ROLLOUTS)
-    hidden = frame_at(engine, replace(scenario, view=replace(scenario.view, ghost=False)), Stage.ROLLOUTS)
-    for a, b in zip(seen.rollouts, hidden.rollouts, strict=True):
-        np.testing.assert_array_equal(a, b)
-
-
 @pytest.mark.parametrize("space", ["task", "cspace"])
 def test_the_arm_moves_along_its_rollout_in_a_drag_only_where_that_is_shown(new_engine, initial, space):
     hidden, engine, seen = changed(initial("draw_s"), space=space), new_engine(), []

@@ -26,7 +26,7 @@ from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.jobs import Jobs
 from dt_viz.session.progress import Message, Pace, Progress
 from dt_viz.session.session import Session
-from dt_viz.ui.tabs.status import BUTTON, CHANGED, HINT, LEADING, PALE, REASON, details_html, hint
+from dt_viz.ui.tabs.status import BUTTON, CHANGED, HINT, LEADING, PALE, REASON, details_html, hint, hint_html
 from dt_viz.ui.tabs.verdict import COMPUTING, FAILED, HOLDS, WARP_HINT, Verdict, concerns, remedy, verdict
 from dt_viz.warning import ARM, Concern, Kind, MotionWarning, Severity
 
@@ -358,14 +358,13 @@ def test_nothing_moves_when_a_message_comes_or_something_is_learned(panel):
         assert (panel.status.mend.visible, panel.status.cancel.visible) == (mends, cancels)
 
 
-def test_hints_take_the_same_room_and_are_told_in_full(panel):
+def test_hints_take_the_same_room_and_are_told_in_full():
     """A line of the panel holds about 44 characters."""
     texts = [scene.line for scene in SCENES.values()] + [entry().hint for entry in TASKS.values()] + [CHANGED, ""]
     rooms = set()
     for text in texts:
-        panel.give_hint(text)
-        rooms |= set(re.findall(r"<div style='height:([\d.]+)em", panel.hint.content))
-        assert text in html.unescape(panel.hint.content)
+        rooms |= set(re.findall(r"<div style='height:([\d.]+)em", hint_html(text)))
+        assert text in html.unescape(hint_html(text))
         assert len(textwrap.wrap(text, 44)) * LEADING <= HINT
     assert rooms == {f"{HINT:.3f}"}
 

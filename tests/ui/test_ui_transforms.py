@@ -168,16 +168,6 @@ def test_playing_goes_from_straight_rays_to_the_full_stack_as_one_step_for_undo(
     assert session.scenario == SCENARIO
 
 
-def test_playing_that_ends_as_it_began_leaves_nothing_to_undo(session, monkeypatch):
-    session.edit("T", **changing(session.scenario, temperature=9.0))
-    session.end_gesture()
-    told = []
-    play_warp(session, told, 0.2, monkeypatch)
-    wait_until(lambda: told == [True, False])
-    session.undo()
-    assert session.scenario == SCENARIO
-
-
 def test_playing_stops_when_it_is_told_to_or_something_else_is_moved(session, monkeypatch):
     told = []
     play_warp(session, told, 1000.0, monkeypatch)

@@ -45,11 +45,7 @@ def has_room(scenario: Scenario) -> bool:
 
 @contextmanager
 def turn(wait: Callable[[], None], left: Cancelled) -> Iterator[None]:
-    """Wait until no other visitor's file is being read, and read within the block.
-
-    Args:
-        wait: called if that has to be waited for.
-        left: whether the visitor has left.
+    """Wait until no other visitor's file is being read, and read within the block; call `wait` if that takes time.
 
     Raises:
         UnwantedError: the visitor has left, before the block or within it.
@@ -135,11 +131,11 @@ class FileLoader:
 def from_file(
     content: bytes, name: str, scale: float, cancelled: Cancelled = never
 ) -> tuple[Obstacle, tuple[str, ...]]:
-    """Return the obstacle that a file holds, around the origin, and notes about it for the page.
+    """Return the obstacle that a file of such a suffix holds, around the origin, and notes about it for the page.
 
     Args:
-        content: all bytes of the file.
-        name: name of the file; its suffix says what it is. A PLY without faces is a point cloud.
+        content: all bytes of the file; a PLY without faces is a point cloud.
+        name: name of the file.
         scale: metres for one unit of the file.
         cancelled: whether nobody wants it any more.
 

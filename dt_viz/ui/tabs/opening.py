@@ -74,15 +74,7 @@ class OpenPanel:
     def __init__(
         self, gui: viser.GuiApi, bindings: Bindings, show: Show, learn: Callable[[Session, Task], None], most: int
     ) -> None:
-        """Build the controls where the panel is being built.
-
-        Args:
-            gui: controls of the visitor.
-            bindings: bindings of the panel.
-            show: shows what is open in the scene.
-            learn: has a task learned.
-            most: largest number of bytes of all files.
-        """
+        """Build the controls where the panel is being built; files may have `most` bytes together."""
         self._bindings, self._show, self._learn, self._most = bindings, show, learn, most
         self._changing = threading.RLock()  # one thread reads, another inspects, and handlers close what is open
         self._opened = Opened()

@@ -37,15 +37,7 @@ def small(text: str, *, tight: bool = False) -> str:
 def add_plot(
     gui: viser.GuiApi, title: str, across: str, curves: Sequence[uplot.Series], height: int
 ) -> viser.GuiUplotHandle:
-    """Add an empty plot below its title, which is HTML, where the panel is being built.
-
-    Args:
-        gui: controls of the visitor.
-        title: title; none if empty.
-        across: what is told to the right.
-        curves: its curves.
-        height: height, pixels.
-    """
+    """Add an empty plot of curves below its title, which is HTML, where the panel is being built."""
     if title:
         gui.add_html(small(title, tight=True))
     font = "11px sans-serif"

@@ -27,15 +27,7 @@ Offered = Callable[[PageEntry], Iterable[Setting]]
 def add_settings(
     gui: viser.GuiApi, bindings: Bindings, offered: Offered, chosen: Chosen, order: float | None = None
 ) -> None:
-    """Build the controls of the settings of all kinds of transforms.
-
-    Args:
-        gui: controls of the visitor, in the folder that they go into.
-        bindings: bindings of the visitor's panel.
-        offered: settings of a kind that are shown here.
-        chosen: transform whose settings they are.
-        order: order of all of them in the folder.
-    """
+    """Build the controls of the settings of all kinds of transforms, of which those of the chosen one are shown."""
     for setting in dict.fromkeys(setting for entry in registry.KINDS.values() for setting in offered(entry)):
         _SettingField(gui, bindings, offered, chosen, setting).add({"order": order, "visible": False})
 
@@ -89,13 +81,9 @@ class _SettingField:
         meant: Callable[[Any, Any], Any],
         visible: Callable[[Any], bool] = lambda _value: True,
     ) -> Control:
-        """Bind an input to the field.
+        """Bind an input, visible where there is a field to be seen, to it.
 
-        Args:
-            handle: handle of the input.
-            shown: value of the input for the field's.
-            meant: value of the field for its old one and the input's.
-            visible: whether the input is shown for the field's value; it never is where there is no field.
+        `shown` is the input's value for the field's, `meant` the field's for its old one and the input's.
         """
 
         def change(scenario: Scenario, value: Any) -> Mapping[str, Any]:  # noqa: ANN401

@@ -127,8 +127,10 @@ def _rows(frame: Frame, pace: Pace, view: View) -> Iterator[tuple[str, str]]:
     unknown = "–" if frame.blocked or frame.stage is Stage.CERTIFIED else "…"
     off = "–" if frame.blocked else "off"
     whole_arm = frame.scenario.arm_avoidance is not None
-    yield "Rebuild", _rebuild(pace)
-    yield "Clearance", off if frame.blocked else clearance_text(known.clearance, whole_arm=whole_arm)
+    rate = f" · {pace.rate:.0f} frames/s" if pace.rate > 1 else ""
+    yield "Rebuild", f"{1e3 * pace.latency:.0f} ms{rate} · {pace.num_skipped} skipped"
+    clearance = f"{1e3 * known.clearance:.1f} mm, {'body points' if whole_arm else 'end effector'}"
+    yield "Clearance", off if frame.blocked else "no obstacle" if known.clearance == float("inf") else clearance
     if shows_arm(view):
         yield from collision_rows(known.collision, unknown)
         if frame.has_orientation:
@@ -140,23 +142,11 @@ def _rows(frame: Frame, pace: Pace, view: View) -> Iterator[tuple[str, str]]:
     yield "Lyapunov value", {None: unknown, True: "falls", False: "does not fall"}[known.lyapunov_falls]
 
 
-def _rebuild(pace: Pace) -> str:
-    """Describe the speed of rebuilding."""
-    rate = f" · {pace.rate:.0f} frames/s" if pace.rate > 1 else ""
-    return f"{1e3 * pace.latency:.0f} ms{rate} · {pace.num_skipped} skipped"
-
-
 def error_text(length: float) -> str:
     """Format a length, metres, that should be zero: rounding is exact."""
     if length < 1e-12:  # metres
         return "exact"
     return "< 0.001 mm" if length < 1e-6 else in_millimetres(length)
-
-
-def clearance_text(clearance: float, *, whole_arm: bool) -> str:
-    """Format a clearance, metres, and whose it is."""
-    whose = "body points" if whole_arm else "end effector"
-    return "no obstacle" if clearance == float("inf") else f"{1e3 * clearance:.1f} mm, {whose}"
 
 
 def _duration_rows(frame: Frame, off: str) -> tuple[tuple[str, str], ...]:

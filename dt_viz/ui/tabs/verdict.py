@@ -85,7 +85,8 @@ def concerns(frame: Frame, view: View) -> tuple[MotionWarning, ...]:
         why = " at this flow time" if scenario.avoids else ": nothing avoids it"
         found.append(MotionWarning(kind, f"the motions go through the obstacle{why}"))
     if scenario.avoids and scenario.arm_avoidance is None:
-        found = [_of_hand(warning) if warning.kind is Kind.ARM_ENTERS else warning for warning in found]
+        hand = "only the path of the hand gives way"
+        found = [replace(w, text=f"{w.text}: {hand}") if w.kind is Kind.ARM_ENTERS else w for w in found]
     return tuple(sorted(found, key=lambda warning: warning.kind.concern.gravity))
 
 
@@ -106,10 +107,6 @@ def _clearance_text(frame: Frame, view: View) -> str:
     return "no obstacle" if distance == float("inf") else f"{1e3 * distance:.0f} mm".replace("-", "−")
 
 
-def _of_hand(warning: MotionWarning) -> MotionWarning:
-    return replace(warning, text=f"{warning.text}: only the path of the hand gives way")
-
-
 @dataclass(frozen=True)
 class Remedy:
     """An edit that mends something."""
@@ -121,12 +118,7 @@ class Remedy:
 
 
 def remedy(frame: Frame, wanted: Scenario) -> Remedy | None:
-    """Return what mends the reason that matters most; None if nothing is known to, or the frame is of another motion.
-
-    Args:
-        frame: the newest frame.
-        wanted: the scenario that is wanted now, which the remedy changes.
-    """
+    """Return what mends the gravest problem of the newest frame; None if nothing does, or other motions are wanted."""
     if frame.blocked or frame.scenario.choices != wanted.choices:
         return None
     if wanted.warp < 1:
@@ -136,29 +128,19 @@ def remedy(frame: Frame, wanted: Scenario) -> Remedy | None:
 
 
 def _against(mend: Mend | None, source: str, scenario: Scenario) -> Remedy | None:
-    whole = scenario.view.arm
-    if mend is Mend.INTEGRATION:
-        return _integrated_automatically(scenario, source)
+    whole, avoidance = scenario.view.arm, scenario.avoidance
     enters = mend is Mend.WHOLE_ARM and scenario.arm_avoidance is None and whole
     if enters or (mend is Mend.FLOW and not avoidance_layer(scenario).on):
         label = "Let the whole arm avoid" if whole else "Let the hand avoid"
         return Remedy(label, {"stack": avoiding_with(scenario, "cspace" if whole else "task")})
-    return _with_another_flow(scenario) if mend is Mend.FLOW else None
-
-
-def _with_another_flow(scenario: Scenario) -> Remedy | None:
-    """Return the first choice by hand about the flow of the avoidance that can be left to the automatic one."""
-    avoidance = scenario.avoidance
-    if avoidance.duration is not None:
+    # what was chosen by hand is left to the automatic choice
+    if mend is Mend.FLOW and avoidance.duration is not None:
         return Remedy("Choose the flow time automatically", {"stack": with_avoidance(scenario, duration=None)})
-    if avoidance.integration.by_hand:
-        return _integrated_automatically(scenario, avoidance_layer(scenario).name)
-    if avoidance.generator == "probability":
+    if mend is Mend.INTEGRATION or (mend is Mend.FLOW and avoidance.integration.by_hand):
+        name = source if mend is Mend.INTEGRATION else avoidance_layer(scenario).name
+        transform: Any = transform_of(scenario, name)
+        automatic = replace(transform, integration=replace(transform.integration, method="auto"))
+        return Remedy("Integrate automatically", {"stack": with_transform(scenario, name, automatic)})
+    if mend is Mend.FLOW and avoidance.generator == "probability":
         return Remedy("Use the free-space generator", {"stack": with_avoidance(scenario, generator="free-space")})
     return None
-
-
-def _integrated_automatically(scenario: Scenario, name: str) -> Remedy:
-    transform: Any = transform_of(scenario, name)
-    automatic = replace(transform, integration=replace(transform.integration, method="auto"))
-    return Remedy("Integrate automatically", {"stack": with_transform(scenario, name, automatic)})
