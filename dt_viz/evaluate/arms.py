@@ -110,7 +110,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run the command."""
-    out, jaco = ready_to_write(options.out, ".npz"), new_engine(TASKS)
+    out, jaco = ready_to_write(options.out, "FILE.npz"), new_engine(TASKS)
     engines = {arm: new_engine(TASKS, arm) for arm in options.arm}
     rows, arrays = [], {}
     for arm, engine in engines.items():
@@ -169,7 +169,7 @@ def _passages(engine: Engine, options: argparse.Namespace) -> Iterator[Passage]:
         ball, postures, again = _passable_ball(engine, task, rng, options.size)
         avoidance = ArmAvoidance(ball)
         place = measured(engine, task, avoidance)
-        values = (*ball.position, ball.radius), again, len(place.ends) - 1, len(place.rollouts)
+        values = (*ball.position, ball.radius), again, len(place.ends) - 1, len(place.motions)
         passage = Passage(task.name, *values, avoidance.margin - place.clearance, place.clearance)
         if place.motions:
             joints, goal = _in_the_loop(engine, avoiding(task, avoidance), int(rng.choice([*place.motions])))

@@ -56,16 +56,7 @@ class Visitor(Display):
         task: str,
         arms: ArmStore | None = None,
     ) -> None:
-        """Build the page and start computing.
-
-        Args:
-            client: connection of the visitor.
-            engine: engine of this visitor only.
-            robot: the first arm.
-            titles: titles of the tasks, by name.
-            task: name of the first task.
-            arms: arms to choose from; None is the first one alone.
-        """
+        """Build the page for an engine of its own and start computing; there is one arm where there are no `arms`."""
         self.client = client
         self.shown: Frame | None = None
         """The last drawn frame."""
@@ -153,7 +144,6 @@ class Visitor(Display):
         self.client.flush()
 
     def _pose(self) -> None:
-        """Draw the scene a moment later."""
         now = time.monotonic()
         self._camera.turn(now)
         with self._exchanging:
@@ -175,7 +165,6 @@ class Visitor(Display):
         self._camera.reframe(arm_size=robot.size)
 
     def _dress(self, theme: Theme) -> None:
-        """Show the panel in a theme."""
         self._theme = theme
         self.client.gui.configure_theme(
             dark_mode=theme is DARK, show_logo=False, show_share_button=False, brand_color=LIGHT.brand
@@ -187,7 +176,6 @@ class Visitor(Display):
         self._paint(self._theme)
 
     def _paint(self, theme: Theme) -> None:
-        """Show the scene in a theme."""
         with self.client.atomic(), self._exchanging:
             self.pictures.paint(theme)
             self.robot.paint(theme)

@@ -13,7 +13,6 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from PIL import Image
@@ -30,6 +29,7 @@ from dt_viz.ui.server import Server
 from dt_viz.ui.visitor import Visitor
 from tests.chromium import ARGUMENTS, CHROMIUM
 
+OUT = "DIR"
 FIRST = "first"
 """Name of the picture of the first page."""
 DRAWING = 8.0
@@ -43,7 +43,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--only", choices=names, nargs="+", metavar="NAME", help=", ".join(names))
     add_lasa(parser)
     parser.add_argument("--size", type=_size, default=(1920, 1080), metavar="W,H", help="pixels (default: 1920,1080)")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -59,7 +58,6 @@ def run(options: argparse.Namespace) -> int:
     lacking = [name for name in options.only or () if name not in scenes]
     if lacking:
         raise InputError("--only", ", ".join(lacking), "scenes whose tasks there are; --lasa DIR adds more")
-    options.out.mkdir(parents=True, exist_ok=True)
     width, height = options.size
     complaints: list[str] = []
     with sync_playwright() as playwright:

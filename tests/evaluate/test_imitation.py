@@ -174,7 +174,7 @@ def test_what_is_held_out_is_not_learned_from():
     assert [f.demonstration.name for f in followed] == ["0", "1", "2", "3"]
     nearest = resample_by_arc_length(demonstrations[1].positions, 400)  # the nearest start of 1 and 3
     np.testing.assert_allclose(
-        followed[0].paths["nearest"] - nearest,
+        followed[0].motions["nearest"][0] - nearest,
         np.linspace(1, 0, 400)[:, None] * (demonstrations[0].positions[0] - nearest[0]),
         atol=1e-12,
     )

@@ -1,6 +1,5 @@
 """Obstacles that cross the motion of the robot in the loop: where they go, and what is measured."""
 
-from dataclasses import replace
 from itertools import islice
 
 import numpy as np
@@ -118,14 +117,13 @@ def test_figures_of_a_run_are_relative_to_the_limits(bench):
     q = bench.starts[0] + np.cumsum([[0.0], [0.01], [0.03], [0.03]], axis=0) * np.eye(6)[0]
     away = [np.array([[3.0, 0.0, 0.0]])] * 4
     run = reactive.Run(list(q), [0.0, 0.01, 0.02, 0.03], away, [0.001, 0.003])
-    found = reactive.RunFigures.of(
-        bench, reactive.Crossing(0, 0.01, (reactive.Passage(np.zeros((2, 3)), 0.0, 1.0, 1.0),)), run, 0.005
-    )
-    assert found.velocity == pytest.approx(3.0 / bench.robot.velocity_limits[0])
-    assert found.acceleration == pytest.approx(200 / ControllerSettings().acceleration)
-    assert found.lost == pytest.approx(0.015) and found.distance > 2
-    assert found.missed == pytest.approx(np.linalg.norm(bench.robot.end_effector(q[-1]) - bench.goal))
-    touched = replace(found, distance=-0.002, missed=1e-4, lost=0.215)
+    crossing = reactive.Crossing(0, 0.01, (reactive.Passage(np.zeros((2, 3)), 0.0, 1.0, 1.0),))
+    found = reactive.figures_of(bench, crossing, run, 0.005)
+    assert found["velocity"] == pytest.approx(3.0 / bench.robot.velocity_limits[0])
+    assert found["acceleration"] == pytest.approx(200 / ControllerSettings().acceleration)
+    assert found["lost"] == pytest.approx(0.015) and found["clearance"] > 2e3
+    assert found["missed"] == pytest.approx(1e3 * np.linalg.norm(bench.robot.end_effector(q[-1]) - bench.goal))
+    touched = found | {"clearance": -2.0, "missed": 0.1, "lost": 0.215}
     row = reactive.summary([found, touched, touched])
     assert [row[name] for name in ("without contact", "clearance mm", "goal reached")] == ["1 of 3", "-2.0", "2 of 3"]
     assert [row[name] for name in ("time lost s", "tick ms")] == ["0.2 (0.2)", "2.00 (3.0, 3)"]

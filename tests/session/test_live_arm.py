@@ -162,18 +162,6 @@ def test_pushed_aside_again_and_again_it_still_reaches_the_goal(whole):
     assert whole.robot.end_effector(np.array(whole.passed))[:, 2].min() > 0
 
 
-def test_pushes_differ_and_are_the_same_every_time(begin, initial):
-    def pushed(times):
-        loop = begin(changed(initial("draw_s"), space="task")).run(2.0)
-        for _ in range(times):
-            loop.arm.push()
-            loop.run(0.4)
-        return loop.hand
-
-    np.testing.assert_array_equal(pushed(1), pushed(1))
-    assert np.linalg.norm(pushed(2) - pushed(1)) > 0.01
-
-
 class TestHolding:
     def held(self, loop, place):
         for u in np.linspace(0, 1, 12):

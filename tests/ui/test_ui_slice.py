@@ -35,7 +35,7 @@ from dt_viz.ui.scene.slice_layers import (
     scale_of,
 )
 from dt_viz.ui.scene.tubes import NUM_SIDES, RolloutTubes
-from dt_viz.ui.tabs.show import WHOLE_ARM_NOTE, SlicePanel
+from dt_viz.ui.tabs.show import WHOLE_ARM_NOTE, ShowTab
 
 SCENARIO = avoiding("draw_s", (Sphere((0.0, -0.5, 0.4)),))
 POSE = SlicePose((0.1, -0.4, 0.5), (0.6, 0.8, 0.0, 0.0))
@@ -251,7 +251,7 @@ def test_a_saved_picture_is_white_behind_or_transparent():
 @pytest.fixture
 def opened(server):
     bound = Bound(SCENARIO)
-    yield SlicePanel(server.gui, bound), bound
+    yield ShowTab(server.gui, bound), bound
     server.gui.reset()
 
 
