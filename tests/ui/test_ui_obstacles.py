@@ -294,7 +294,6 @@ def test_the_map_is_painted_on_the_slice_the_right_way_up(server):
     made = occupancy_picture(task.slice, (ball,), coarse=True)
     picture.draw(frame_of(scenario(ball), pictures=Pictures(occupancy=made)), Look())
     image = picture.image.handle
-    assert image is not None
     painted = painted_at(image, task.slice.half_size, image.image[..., 3] > 190)
     np.testing.assert_allclose(painted, ball.position, atol=0.004)
     np.testing.assert_allclose(picture.level.node.points, made.level, atol=1e-6)
