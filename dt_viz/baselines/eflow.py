@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from dt_viz.baselines.base import Method, Plan, Planner, Problem
+from dt_viz.baselines.base import Plan, Planner, Problem
 from dt_viz.baselines.weights import FOLDER, check_shapes, load_weights
 from dt_viz.errors import Cancelled, never
 from dt_viz.flows.diffeomorphisms import Chain, Diffeomorphism, Placed
@@ -256,32 +256,20 @@ class EFlowSystem:
         return bundle.paths, tuple(np.append(0.0, np.cumsum(step)) for step in steps)
 
 
-@dataclass(frozen=True, eq=False)
-class _Planner:
-    system: EFlowSystem
-    spacing: float
-
-    def plan(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
-        """Plan without regard to the obstacle; see `Planner`."""
-        return Plan(*self.system.rollouts(starts, self.spacing))
+def load_system(task: Task, folder: Path = FOLDER) -> EFlowSystem:
+    """Load the weights of a task. Raises NotFittedError as `fit`."""
+    return EFlowSystem.of(task, load_weights("eflow", VERSION, task, folder))
 
 
-class EFlow(Method):
-    """EFlow: imitation alone."""
+def fit(problem: Problem, folder: Path = FOLDER) -> Planner:
+    """Load the task's weights; motions are the same around all obstacles.
 
-    name, title = "eflow", "EFlow"
-    promise = "Stable: every motion reaches the goal, by construction. It does not avoid."
-    stable, whole_arm, live = True, False, True
-    avoids = False
+    Raises:
+        NotFittedError: there are none that can be used.
+    """
+    system = load_system(problem.task, folder)
 
-    def __init__(self, spacing: float = LIVE.spacing, folder: Path = FOLDER) -> None:
-        """Choose the largest distance between samples of a path, metres, and the folder of the weights."""
-        self.spacing, self.folder = spacing, folder
+    def plan(obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
+        return Plan(*system.rollouts(starts, LIVE.spacing))
 
-    def fit(self, problem: Problem) -> Planner:
-        """Load the task's weights; see `Method`."""
-        return _Planner(self.system(problem.task), self.spacing)
-
-    def system(self, task: Task) -> EFlowSystem:
-        """Load the task's weights. Raises NotFittedError as `Method.fit`."""
-        return EFlowSystem.of(task, load_weights("eflow", VERSION, task, self.folder))
+    return plan

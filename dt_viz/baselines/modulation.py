@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.integrate import cumulative_trapezoid, solve_ivp
 
-from dt_viz.baselines.base import Method, NotFittedError, Plan, Planner, Problem
+from dt_viz.baselines.base import NotFittedError, Plan, Planner, Problem
 from dt_viz.errors import Cancelled, never
 from dt_viz.flows.fields import Array
 from dt_viz.flows.rollouts import ARRIVED
@@ -89,7 +89,7 @@ class _Planner:
     """Our imitation."""
     settings: ModulationSettings
 
-    def plan(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
+    def __call__(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
         """Plan motions of the end effector; see `Planner`."""
         settings, base, num = self.settings, self.system.base, len(starts)
 
@@ -142,20 +142,9 @@ class _Planner:
         return y, step[:, None] * np.linalg.solve(D, v[..., None])[..., 0], step
 
 
-class Modulation(Method):
-    """Our imitation, its velocity modulated around the obstacles."""
-
-    name, title = "modulation", "Modulation"
-    promise = "The end effector's velocity never leads into a star-shaped obstacle; a motion may stop before one."
-    stable, whole_arm, live = False, False, True
-
-    def __init__(self, settings: ModulationSettings | None = None) -> None:
-        """Choose the settings."""
-        self.settings = settings or ModulationSettings()
-
-    def fit(self, problem: Problem) -> Planner:
-        """Take what is learned already; see `Method`."""
-        system = problem.learned.system
-        if system.transform.dim != problem.task.starts.shape[1]:
-            raise NotFittedError("modulation turns velocities at places; this task is learned in augmented states")
-        return _Planner(system, self.settings)
+def fit(problem: Problem, settings: ModulationSettings | None = None) -> Planner:
+    """Take what is learned already. Raises NotFittedError where that is not a velocity at each place."""
+    system = problem.learned.system
+    if system.transform.dim != problem.task.starts.shape[1]:
+        raise NotFittedError("modulation turns velocities at places; this task is learned in augmented states")
+    return _Planner(system, settings or ModulationSettings())

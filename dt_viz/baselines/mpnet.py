@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dt_viz.baselines.base import Method, NotFittedError, Plan, Planner, Problem
+from dt_viz.baselines.base import NotFittedError, Plan, Planner, Problem
 from dt_viz.baselines.postures import PlanningScene, Query, planned
 from dt_viz.baselines.weights import FOLDER, check_shapes, load_weights
 from dt_viz.errors import Cancelled, end_if, never
@@ -204,10 +204,9 @@ class MPNetPlanner:
 
     problem: Problem
     model: MPNetModel
-    replan: Replan | None = None
-    """Plans again what the network finds no free way for."""
+    replan: Replan | None
 
-    def plan(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
+    def __call__(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
         """Plan around an obstacle as far as that succeeds; see `Planner`."""
         surroundings = PlanningScene.of(self.problem.robot, obstacle)
         queries, ways, warnings = [], [], []
@@ -222,26 +221,18 @@ class MPNetPlanner:
         return planned(self.problem, queries, ways, tuple(warnings))
 
 
-class MPNet(Method):
-    """MPNet with neural replanning."""
+def fit(problem: Problem, replan: Replan | None = None, folder: Path = FOLDER) -> Planner:
+    """Load the task's network.
 
-    name, title = "mpnet", "MPNet"
-    promise = (
-        "A path planned once, which ends at the goal, through the obstacle where no free way is found: trained on "
-        "demonstrations alone, it has seen no obstacle."
-    )
-    stable, whole_arm, live = False, True, False
+    Args:
+        problem: the task.
+        replan: plans again what the network finds no free way for.
+        folder: of the weights.
 
-    def __init__(self, folder: Path = FOLDER) -> None:
-        """Choose the folder of the weights."""
-        self.folder = folder
-
-    def fit(self, problem: Problem) -> Planner:
-        """Load the task's weights; see `Method`."""
-        return MPNetPlanner(problem, self.model(problem))
-
-    def model(self, problem: Problem) -> MPNetModel:
-        """Load the task's network. Raises NotFittedError as `Method.fit`, and for another arm."""
-        if problem.robot.name != TRAINED_FOR:
-            raise NotFittedError(f"trained for the {TRAINED_FOR.upper()} only")
-        return MPNetModel.of(load_weights(MPNet.name, VERSION, problem.task, self.folder), problem.robot.num_joints)
+    Raises:
+        NotFittedError: there are no weights that can be used, or it is another arm.
+    """
+    if problem.robot.name != TRAINED_FOR:
+        raise NotFittedError(f"trained for the {TRAINED_FOR.upper()} only")
+    arrays = load_weights("mpnet", VERSION, problem.task, folder)
+    return MPNetPlanner(problem, MPNetModel.of(arrays, problem.robot.num_joints), replan)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -60,7 +61,7 @@ def load_weights(method: str, version: int, task: Task, folder: Path = FOLDER) -
         raise NotFittedError(text)
     try:
         with parsing(WeightsError, path, "file", accepted):
-            with np.load(path, allow_pickle=False) as archive:
+            with np.load(BytesIO(path.read_bytes()), allow_pickle=False) as archive:
                 arrays = dict(archive)
             for field, wanted in _stamp(method, version, task).items():
                 found = arrays.pop(field).item()

@@ -225,7 +225,7 @@ def measured(planner: Planner, problem: Problem, places: Sequence[RandomPlace]) 
     rows, reached, seconds = [], [], []
     for k, place in enumerate(places):
         began = time.thread_time()
-        plan = planner.plan(place.obstacle, task.starts)
+        plan = planner(place.obstacle, task.starts)
         seconds.append(time.thread_time() - began)
         for i, motion in enumerate(zip(plan.paths, plan.times, joints_along(problem, plan), strict=True)):
             arrays |= {f"{name}_{k}_{i}": values for name, values in zip("xtq", motion, strict=True)}
@@ -279,7 +279,7 @@ def _ends(planner: Planner, place: RandomPlace) -> Array:
     if not len(place.perturbed):
         return place.perturbed
     try:
-        return np.stack([path[-1] for path in planner.plan(place.obstacle, place.perturbed).paths])
+        return np.stack([path[-1] for path in planner(place.obstacle, place.perturbed).paths])
     except UnreachableError:
         return np.full_like(place.perturbed, np.inf)
 

@@ -109,7 +109,7 @@ def _row(
         path = weights_file(folder, method, task)
         save_weights(path, method, trained.version, problem.task, arrays)
         sizes.append(path.stat().st_size)
-        plan = trained.from_folder(folder).fit(problem).plan(Union(), task.starts[compared])
+        plan = trained.fit(problem, folder=folder)(Union(), task.starts[compared])
         distances.extend(1e3 * frechet(plan.paths, [task.paths[i] for i in compared]) / task.scale)
     return {
         "method": method,

@@ -122,7 +122,7 @@ class Comparison:
         if isinstance(planner, str):
             return Compared(method, note=planner)
         try:
-            plan = planner.plan(obstacle, learned.task.starts, cancelled)
+            plan = planner(obstacle, learned.task.starts, cancelled)
         except UnreachableError as error:
             return Compared(method, note=str(error))
         stays = sum(len(path) < 2 for path in plan.paths)

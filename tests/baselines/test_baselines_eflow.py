@@ -6,7 +6,7 @@ from oracles import central_differences, stepped
 from plans import eflow_weights as weights
 
 from dt_viz.baselines.base import NotFittedError
-from dt_viz.baselines.eflow import EFlow, EFlowSystem
+from dt_viz.baselines.eflow import EFlowSystem, load_system
 from dt_viz.evaluate.held_out import frechet
 from dt_viz.flows.diffeomorphisms import round_trip_error
 from dt_viz.scenario.tasks import TASKS
@@ -105,7 +105,7 @@ def test_the_gradient_that_training_follows_is_that_of_finite_differences(task):
 
 @pytest.mark.parametrize("name", TASKS)
 def test_shipped_weights_fit_their_task_reach_its_goal_and_are_small(name):
-    task, system = TASKS[name](), EFlow().system(TASKS[name]())
+    task, system = TASKS[name](), load_system(TASKS[name]())
     assert (ASSETS / "baselines" / f"eflow_{name}.npz").stat().st_size <= 1e6
     paths, times = system.rollouts(task.starts, 0.012)
     assert max(np.linalg.norm(path[-1] - system.goal) for path in paths) < 1e-6

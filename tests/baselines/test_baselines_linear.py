@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from plans import joints_of
 
-from dt_viz.baselines.linear import Linear
+from dt_viz.baselines import linear
 from dt_viz.baselines.postures import PlanningScene, Query, planned
 from dt_viz.obstacles.shapes import Box, Sphere, as_point
 from dt_viz.obstacles.union import Union
@@ -14,7 +14,7 @@ from dt_viz.robot.models import load_jaco
 
 
 def test_joints_go_straight_from_the_demonstrated_start_to_the_demonstrated_goal(problem):
-    plan = Linear().fit(problem).plan(Union(), problem.task.starts)
+    plan = linear.fit(problem)(Union(), problem.task.starts)
     for i, (q, t) in enumerate(zip(joints_of(plan), plan.times, strict=True)):
         start, goal = problem.postures[i][[0, -1]]
         np.testing.assert_allclose(q, start + np.linspace(0, 1, len(q))[:, None] * (goal - start), atol=1e-9)
@@ -25,7 +25,7 @@ def test_joints_go_straight_from_the_demonstrated_start_to_the_demonstrated_goal
 
 def test_another_start_is_reached_by_inverse_kinematics_near_the_nearest_demonstration(problem):
     start = problem.task.starts[2] + np.array([0.0005, 0.001, 0.001])
-    plan = Linear().fit(problem).plan(Union(), start[None])
+    plan = linear.fit(problem)(Union(), start[None])
     np.testing.assert_allclose(plan.paths[0][0], start, atol=1e-4)
     assert np.abs(joints_of(plan)[0][0] - problem.postures[2][0]).max() < 0.03
     np.testing.assert_array_equal(joints_of(plan)[0][-1], problem.postures[2][-1])
@@ -33,14 +33,14 @@ def test_another_start_is_reached_by_inverse_kinematics_near_the_nearest_demonst
 
 def test_a_start_out_of_reach_is_refused(problem):
     with pytest.raises(UnreachableError):
-        Linear().fit(problem).plan(Union(), np.array([[2.0, 0.0, 0.5]]))
+        linear.fit(problem)(Union(), np.array([[2.0, 0.0, 0.5]]))
 
 
 def test_an_obstacle_changes_nothing(problem):
-    planner, start = Linear().fit(problem), problem.task.starts[:1]
-    free = planner.plan(Union(), start)
+    planner, start = linear.fit(problem), problem.task.starts[:1]
+    free = planner(Union(), start)
     ball = Union((Sphere(as_point(free.paths[0][100]), 0.15),))
-    np.testing.assert_array_equal(joints_of(free)[0], joints_of(planner.plan(ball, start))[0])
+    np.testing.assert_array_equal(joints_of(free)[0], joints_of(planner(ball, start))[0])
 
 
 def test_corners_are_kept_and_joints_stay_within_their_velocity_limits(problem):

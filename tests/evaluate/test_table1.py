@@ -2,12 +2,14 @@
 
 import json
 import sys
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
+from dt_viz.baselines import mpnet
 from dt_viz.baselines.base import Plan
-from dt_viz.baselines.mpnet import MPNet
 from dt_viz.baselines.registry import METHODS, problem_of
 from dt_viz.errors import never
 from dt_viz.evaluate import figures, table1
@@ -123,15 +125,12 @@ def test_motions_that_end_beside_the_goal_have_not_reached_it(problem):
     goal, starts = problem.learned.goal, problem.task.starts[:3]
     ends = goal + np.array([[0.0, 0.0, 0.0], [0.005, 0.0, 0.0], [0.0, 0.02, 0.0]])
 
-    class Planner:
-        def plan(self, obstacle, starts, cancelled=never):
-            paths = tuple(
-                np.stack([begin, end]) for begin, end in zip(starts, np.resize(ends, starts.shape), strict=True)
-            )
-            return Plan(paths, tuple(np.array([0.0, 1.0]) for _ in paths), tuple(np.zeros((2, 6)) for _ in paths))
+    def plan(_obstacle, starts, _cancelled=never):
+        paths = tuple(np.stack([begin, end]) for begin, end in zip(starts, np.resize(ends, starts.shape), strict=True))
+        return Plan(paths, tuple(np.array([0.0, 1.0]) for _ in paths), tuple(np.zeros((2, 6)) for _ in paths))
 
     place = table1.RandomPlace(Sphere((5.0, 0.0, 0.0), 0.15), starts)
-    arrays = table1.measured(Planner(), problem, [place])
+    arrays = table1.measured(plan, problem, [place])
     np.testing.assert_allclose(arrays["ends_0"], ends)
     assert arrays["reached"] == pytest.approx([2 / 3])
 
@@ -168,7 +167,8 @@ class TestMissing:
         assert not (tmp_path / "table1.json").exists()
 
     def test_a_method_that_was_not_trained_is_said(self, monkeypatch, tmp_path, capsys):
-        monkeypatch.setitem(METHODS, "mpnet", MPNet(tmp_path))
+        untrained = replace(METHODS["mpnet"], fit=partial(mpnet.fit, folder=tmp_path))
+        monkeypatch.setitem(METHODS, "mpnet", untrained)
         assert main([*ARGUMENTS, "mpnet", "--out", str(tmp_path)]) == 1
         assert "MPNet, Push box: mpnet has not been trained" in capsys.readouterr().err
 

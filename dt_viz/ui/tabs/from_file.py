@@ -146,7 +146,7 @@ def from_file(
     if suffix not in (*MESH_SUFFIXES, *CLOUD_SUFFIXES):
         raise ShapeError(name, "suffix", repr(suffix) if suffix else "no suffix", FORMATS)
     if is_cloud(content, name):
-        loaded = read_cloud(content, name, scale=scale, cancelled=cancelled)
-        return CloudObstacle(ORIGIN, loaded.cloud), loaded.notes
-    loaded = read_mesh(content, name, scale=scale, cancelled=cancelled)
-    return MeshObstacle(ORIGIN, loaded.solid), loaded.notes
+        cloud, notes = read_cloud(content, name, scale=scale, cancelled=cancelled)
+        return CloudObstacle(ORIGIN, cloud), notes
+    solid, notes = read_mesh(content, name, scale=scale, cancelled=cancelled)
+    return MeshObstacle(ORIGIN, solid), notes
