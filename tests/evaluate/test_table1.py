@@ -80,7 +80,7 @@ def test_cells_are_those_of_the_arrays_beside_them(folder, table, method):
 def test_the_paper_stands_beside_what_is_known_of_it(table):
     assert table["linear"]["push_box"]["frechet"]["paper"] == 0.242
     assert table["linear"]["push_box"]["turn"]["paper"] is None
-    arrays = dict.fromkeys(table1.COLUMNS, np.array([[0.1, 0.2]]))
+    arrays: dict[str, np.ndarray] = {column: np.array([[0.1, 0.2]]) for column in table1.COLUMNS}
     cell = table1.cells("ours", "draw_s", arrays)
     assert cell["frechet"] == {"mean": pytest.approx(0.15), "worst": 0.2, "paper": 0.067}
     assert cell["arm_depth"]["paper"] == 0.002
@@ -125,7 +125,7 @@ def test_motions_that_end_beside_the_goal_have_not_reached_it(problem):
     goal, starts = problem.learned.goal, problem.task.starts[:3]
     ends = goal + np.array([[0.0, 0.0, 0.0], [0.005, 0.0, 0.0], [0.0, 0.02, 0.0]])
 
-    def plan(_obstacle, starts, _cancelled=never):
+    def plan(obstacle, starts, cancelled=never):
         paths = tuple(np.stack([begin, end]) for begin, end in zip(starts, np.resize(ends, starts.shape), strict=True))
         return Plan(paths, tuple(np.array([0.0, 1.0]) for _ in paths), tuple(np.zeros((2, 6)) for _ in paths))
 
