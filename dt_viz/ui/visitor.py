@@ -144,7 +144,6 @@ class Visitor(Display):
         self.client.flush()
 
     def _pose(self) -> None:
-        """Draw the scene a moment later."""
         now = time.monotonic()
         self._camera.turn(now)
         with self._exchanging:
@@ -166,7 +165,6 @@ class Visitor(Display):
         self._camera.reframe(arm_size=robot.size)
 
     def _dress(self, theme: Theme) -> None:
-        """Show the panel in a theme."""
         self._theme = theme
         self.client.gui.configure_theme(
             dark_mode=theme is DARK, show_logo=False, show_share_button=False, brand_color=LIGHT.brand
@@ -178,7 +176,6 @@ class Visitor(Display):
         self._paint(self._theme)
 
     def _paint(self, theme: Theme) -> None:
-        """Show the scene in a theme."""
         with self.client.atomic(), self._exchanging:
             self.pictures.paint(theme)
             self.robot.paint(theme)

@@ -90,8 +90,7 @@ class BiasPoints(MarkerGroup[BiasMarker]):
     def draw(self, frame: Frame, look: Look) -> None:
         """Shows the regions, and remembers the slice for drags."""
         super().draw(frame, look)
-        layers = zip(frame.scenario.stack, frame.chosen_values, strict=False)
-        self._used = {layer.name: chosen.get("radius") for layer, chosen in layers}
+        self._used = {name: chosen.get("radius") for name, chosen in frame.chosen_values.items()}
         self._show_regions()
 
     def adopt(self, scenario: Scenario) -> None:
