@@ -16,7 +16,7 @@ from dt_viz.learning.augmented import fit_augmented
 from dt_viz.learning.imitation import fit
 from dt_viz.learning.timing import TimedAttractor
 from dt_viz.metrics import discrete_frechet, distance_from_path
-from dt_viz.scenario.tasks import TASKS, lasa_tasks
+from dt_viz.scenario.tasks import TASKS, known_tasks
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Stage
 from tests.benchmarks import drag, exactness, latency, sitting
@@ -87,7 +87,7 @@ def test_a_frame_counts_where_any_of_its_rollouts_jumps():
 
 
 def test_random_drags_go_through_the_motion_and_repeat(lasa):
-    task, options = lasa_tasks(lasa)["Hook"](), argparse.Namespace(drags=6, seed=3, step=0.001)
+    task, options = known_tasks(lasa)["Hook"](), argparse.Namespace(drags=6, seed=3, step=0.001)
     first, second = (list(drag.paths(task, options)) for _ in range(2))
     assert len(first) == 6
     for places, same in zip(first, second, strict=True):
@@ -114,7 +114,7 @@ def exact(measured):
 
 
 def test_starts_are_spread_over_the_grown_box(lasa):
-    task = lasa_tasks(lasa)["Hook"]()
+    task = known_tasks(lasa)["Hook"]()
     starts = exactness.random_starts(task, 600, 0)
     box = np.concatenate(task.paths)
     middle, size = (box.min(axis=0) + box.max(axis=0)) / 2, np.ptp(box, axis=0)
@@ -177,7 +177,7 @@ def test_stepping_adaptively_is_as_accurate_as_asked_for():
 
 
 def test_velocity_is_timed_for_each_kind_of_stack(lasa, exact, monkeypatch):
-    every = exactness.stacks(lasa_tasks(lasa)["Hook"]())
+    every = exactness.stacks(known_tasks(lasa)["Hook"]())
     assert len(every) == len(set(every.values()))
     few = {name: every[name] for name in ("imitation", "bias point and sphere")}
     monkeypatch.setattr(exactness, "stacks", lambda _task: few)
