@@ -181,7 +181,7 @@ class MPNetPlanner:
 
     def __call__(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
         """Plan around an obstacle as far as that succeeds; see `Planner`."""
-        surroundings = PlanningScene.of(self.problem.robot, obstacle)
+        surroundings = PlanningScene(self.problem.robot, obstacle)
         queries, ways, warnings = [], [], []
         for number, start in enumerate(starts):
             query = Query.of(self.problem, start)
