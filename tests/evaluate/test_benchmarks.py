@@ -76,16 +76,6 @@ def test_a_drag_writes_every_step_and_counts_its_jumps(measured, monkeypatch):
     assert rows[-1]["frames"] == len(places) - 1 and rows[-1]["blocked"] == arrays["blocked"].sum()
 
 
-def test_a_frame_counts_where_any_of_its_rollouts_jumps():
-    rollouts = np.zeros((4, 2, 5, 3))
-    rollouts[1:, 0, :, 0] += 0.04  # less than a jump
-    rollouts[2:, 1, :, 0] += 0.06
-    one = drag.Drag(np.zeros((4, 3)), rollouts, np.array([False, True, True, False]), np.full(4, 0.002))
-    row = drag._row("all", [one, one], [one.moved, one.moved])
-    assert (row["frames"], row["frames in which a rollout jumps"], row["blocked"]) == (6, 2, 4)
-    assert row["largest step mm"] == pytest.approx(60) and row["median ms"] == pytest.approx(2.0)
-
-
 def test_random_drags_go_through_the_motion_and_repeat(lasa):
     task, options = known_tasks(lasa)["Hook"](), argparse.Namespace(drags=6, seed=3, step=0.001)
     first, second = (list(drag.paths(task, options)) for _ in range(2))

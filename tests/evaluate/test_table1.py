@@ -1,7 +1,6 @@
 """The comparison: where the places are, what the cells are made from, and what stands beside them."""
 
 import json
-import sys
 from dataclasses import replace
 from functools import partial
 
@@ -177,13 +176,6 @@ class TestFigure6:
     def test_is_drawn_in_both_formats(self, folder):
         assert (folder / "figure6_push_box.svg").read_text().startswith("<?xml")
         assert (folder / "figure6_push_box.png").read_bytes().startswith(b"\x89PNG")
-
-    def test_is_left_out_without_matplotlib(self, monkeypatch, tmp_path, capsys):
-        monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-        few = ["linear", "--count", "1", "--perturbed", "0"]
-        assert main([*ARGUMENTS, *few, "--out", str(tmp_path)]) == 0
-        assert not list(tmp_path.glob("figure6*")) and (tmp_path / "table1.json").exists()
-        assert capsys.readouterr().err == "no figures: matplotlib is not installed; pip install matplotlib\n"
 
     def test_curves_are_distance_and_depth_along_the_path(self):
         values = np.column_stack([np.full(7, 0.25), np.linspace(0, 0.1, 7)])
