@@ -10,10 +10,9 @@ import pytest
 from dt_viz.baselines import mpnet
 from dt_viz.baselines.base import Plan
 from dt_viz.baselines.registry import METHODS, problem_of
-from dt_viz.errors import never
+from dt_viz.errors import FormatError, never
 from dt_viz.evaluate import figures, table1
 from dt_viz.evaluate.__main__ import main
-from dt_viz.evaluate.options import InputError
 from dt_viz.metrics import discrete_frechet, resample_by_arc_length
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.obstacles.union import Union
@@ -136,7 +135,7 @@ def test_motions_that_end_beside_the_goal_have_not_reached_it(problem):
 
 def test_too_many_places_are_refused(problem, monkeypatch):
     monkeypatch.setattr(table1, "SETTINGS", table1.Table1Settings(max_drawn=3))
-    with pytest.raises(InputError, match="among 3 spheres"):
+    with pytest.raises(FormatError, match="among 3 spheres"):
         table1.drawn(problem, 4, 0, seed=3)
 
 
