@@ -276,7 +276,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run the subcommand."""
     tasks, task = chosen_task(options)
-    out = options.out
     bench = Bench(new_engine(tasks), task.name, options.diameter, options.margin, boxes=options.boxes)
     arrays: dict[str, Any] = {"diameter": options.diameter}
     figures: list[dict[str, Any]] = []
@@ -293,7 +292,7 @@ def run(options: argparse.Namespace) -> int:
         print(i, ", ".join(values), *sorted(phase.value for phase in found.phases), flush=True)
         if len(figures) == options.runs:
             break
-    write_npz(out, **arrays)
+    write_npz(options.out, **arrays)
     shape = "box" if options.boxes else "sphere"
     size = f"{options.obstacles} {shape}(s) of {options.diameter:g} m"
     print(f"\n{task.name}, {size} at {options.speed:g} m/s, margin {options.margin:g} m")
