@@ -24,12 +24,12 @@ from dt_viz.session.progress import Display, Pace, Progress
 from dt_viz.session.session import Session
 from dt_viz.ui.panel import ControlPanel
 from dt_viz.ui.playback import Playback
-from dt_viz.ui.ruler import Ruler
 from dt_viz.ui.scene.camera import CameraController
 from dt_viz.ui.scene.export import RESOLUTIONS, render_png
 from dt_viz.ui.scene.palette import DARK, LIGHT, Colour, Theme
 from dt_viz.ui.scene.robot_scene import RobotScene
 from dt_viz.ui.scene.scene import ScenePictures
+from dt_viz.ui.scripts import Ruler
 
 
 def initial_scenario(engine: Engine, name: str) -> Scenario:
@@ -93,7 +93,7 @@ class Visitor(Display):
         self.client.gui.add_html(self.ruler.html)
 
     def measured(self, width: float) -> None:
-        """Take the width that the window has at least, CSS pixels."""
+        """Take the width of the window, CSS pixels."""
         self._camera.measured(width)
 
     def draw(self, frame: Frame, pace: Pace) -> None:

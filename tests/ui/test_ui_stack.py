@@ -17,7 +17,7 @@ from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.stack import IMITATION, WHOLE_ARM, anchored, avoiding_with, selected
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui.panel import add_avoid_and_imitate, avoids_with
-from dt_viz.ui.scene.bias_points import BiasPoints
+from dt_viz.ui.scene.draggables import BiasPoints
 from dt_viz.ui.scene.picture import Look
 from dt_viz.ui.scene.rollouts import LevelRollouts
 from dt_viz.ui.scene.tubes import NUM_SIDES

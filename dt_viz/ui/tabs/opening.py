@@ -21,8 +21,8 @@ from dt_viz.session.opening import LENGTHS, USUAL_RATES, Choices, Preview
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.controls import Control
-from dt_viz.ui.dropping import drop_html
 from dt_viz.ui.scene.palette import LIGHT
+from dt_viz.ui.scripts import drop_html
 from dt_viz.ui.tabs.from_file import LANE, turn
 from dt_viz.ui.tabs.takes_table import seen_html
 from dt_viz.warning import Severity
