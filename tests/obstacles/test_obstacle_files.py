@@ -135,7 +135,7 @@ class TestMeshes:
         ("content", "name", "words"),
         [
             (b"x" * (MAX_BYTES + 1), "a.obj", "20.0 MB; accepted: at most 20 MB"),
-            (bytes(80) + struct.pack("<I", MAX_FACES + 1), "a.stl", "a .stl file"),
+            (bytes(80) + struct.pack("<I", MAX_FACES + 1), "a.stl", "faces: found none that could be read"),
             (MANY, "a.ply", "faces: found more than 500000 of all parts"),
             (
                 exported(BOX, "stl")[:96] + struct.pack("<f", np.nan) + exported(BOX, "stl")[100:],
