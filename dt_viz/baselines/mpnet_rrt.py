@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from dt_viz.baselines import mpnet
 from dt_viz.baselines.base import Planner, Problem
-from dt_viz.baselines.mpnet import ARCHITECTURE, MPNet, MPNetPlanner, Search
+from dt_viz.baselines.mpnet import ARCHITECTURE, Search
 from dt_viz.flows.fields import Array
 from dt_viz.robot.robot import Robot
 
@@ -23,24 +24,9 @@ _one_at_a_time = threading.Lock()
 """OMPL's random numbers have one seed for the whole process."""
 
 
-class MPNetRRT(MPNet):
-    """MPNet whose colliding stretches RRT-Connect plans again."""
-
-    name, title = "mpnet-rrt", "MPNet-RRT"
-    promise = (
-        "A path planned once, which ends at the goal; the whole arm is clear where RRT-Connect finds a way in time. "
-        "That imitates nothing."
-    )
-    needs = ("ompl",)
-
-    def __init__(self, seconds: float = 10.0) -> None:
-        """Choose the time for a stretch, seconds; where none is found in it, the stretch stays in collision."""
-        super().__init__()
-        self.seconds = seconds
-
-    def fit(self, problem: Problem) -> Planner:
-        """Load MPNet's weights; see `Method`."""
-        return MPNetPlanner(problem, self.model(problem), partial(_connected, seconds=self.seconds))
+def fit(problem: Problem, seconds: float = 10.0) -> Planner:
+    """Load MPNet's weights; a stretch for which no way is found in these seconds stays in collision."""
+    return mpnet.fit(problem, partial(_connected, seconds=seconds))
 
 
 def _connected(search: Search, start: Array, goal: Array, seconds: float) -> list[Array]:
@@ -110,11 +96,11 @@ def _planned(
     setup.setStateValidityChecker(lambda state: is_free(posture(state), posture(state)))
     information.setMotionValidator(motions)
     setup.setPlanner(geometric.RRTConnect(information))
-    ends = space.allocState(), space.allocState()
-    for state, q in zip(ends, (start, goal), strict=True):
+    states: Any = space.allocState(), space.allocState()
+    for state, q in zip(states, (start, goal), strict=True):
         for joint, angle in enumerate(q):
             state[joint] = float(angle)  # copyFromReals of ompl 2.0.1 crashes
-    setup.setStartAndGoalStates(*ends)
+    setup.setStartAndGoalStates(*states)
     setup.solve(base.PlannerTerminationCondition(is_over))
     if not setup.haveExactSolutionPath():
         return []

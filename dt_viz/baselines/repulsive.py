@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from dt_viz.baselines.base import Method, Plan, Planner, Problem
-from dt_viz.baselines.eflow import EFlow, EFlowSystem
+from dt_viz.baselines.base import Plan, Planner, Problem
+from dt_viz.baselines.eflow import EFlowSystem, load_system
 from dt_viz.baselines.weights import FOLDER
 from dt_viz.errors import Cancelled, end_if, never
 from dt_viz.flows.fields import Array, Mask
@@ -57,11 +57,13 @@ class RepulsionSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class _Planner:
+class RepulsivePlanner:
+    """EFlow pushed away from obstacles; see `Planner`."""
+
     system: EFlowSystem
     settings: RepulsionSettings
 
-    def plan(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
+    def __call__(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
         """Plan motions of the end effector; see `Planner`."""
         motions: dict[int, tuple[Array, Array]] = {}
 
@@ -113,17 +115,6 @@ class _Planner:
         return [path[:length] for path, length in zip(np.stack(places, axis=1), lengths, strict=True)], leave
 
 
-class EFlowRepulsive(Method):
-    """EFlow with a repulsive potential."""
-
-    name, title = "eflow-repulsive", "EFlow (repulsive)"
-    promise = "No guarantee: it may stop in a local minimum, and a step may end inside the obstacle."
-    stable, whole_arm, live = False, False, True
-
-    def __init__(self, settings: RepulsionSettings | None = None, folder: Path = FOLDER) -> None:
-        """Choose the settings, and the folder of the weights."""
-        self.settings, self.folder = settings or RepulsionSettings(), folder
-
-    def fit(self, problem: Problem) -> Planner:
-        """Load the task's weights; see `Method`."""
-        return _Planner(EFlow(folder=self.folder).system(problem.task), self.settings)
+def fit(problem: Problem, settings: RepulsionSettings | None = None, folder: Path = FOLDER) -> Planner:
+    """Load EFlow's weights for the task. Raises NotFittedError where there are none that can be used."""
+    return RepulsivePlanner(load_system(problem.task, folder), settings or RepulsionSettings())

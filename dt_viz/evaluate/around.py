@@ -36,7 +36,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from dt_viz.avoidance.avoidance import SPACES, Avoidance
@@ -157,7 +156,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run the command; 1 if the one obstacle that was asked for leaves no motion."""
     tasks, task = chosen_task(options)
-    out, engine = options.out, new_engine(tasks)
+    engine = new_engine(tasks)
     try:
         chosen = {"space": options.space, "generator": options.generator}
         avoided = (Avoidance(obstacles, **chosen) for obstacles in _obstacles(task, options))
@@ -175,7 +174,7 @@ def run(options: argparse.Namespace) -> int:
         for i, motion in one.motions.items():
             x = engine.follower.robot.end_effector(motion.q)
             arrays |= {f"q_{i}": motion.q, f"times_{i}": motion.times, f"x_{i}": x, f"demo_{i}": task.paths[i]}
-    write_npz(out, **arrays)
+    write_npz(options.out, **arrays)
     who = {"task": "the end effector", "cspace": "the whole arm"}[options.space]
     avoids = "nothing" if options.no_avoidance else who
     print(f"{task.name}, {avoids} avoids; worst rollout of each row, clearances negative inside")
@@ -244,7 +243,7 @@ def _obstacles(task: Task, options: argparse.Namespace) -> list[tuple[Obstacle, 
     """The obstacles of the first place, and of each random one."""
     count, (low, high), (begin, end) = options.count, options.size, options.along
     first = SHAPES[0] if options.shape == "any" else options.shape
-    centre = _on(task, (begin + end) / 2) if options.obstacle is None else np.array(options.obstacle)
+    centre = _on(task, np.array([begin + end]) / 2)[0] if options.obstacle is None else np.array(options.obstacle)
     middle = _shaped(first, centre, np.full(3, (low + high) / 2), UPRIGHT)
     drawn = []
     for nth in range(0 if options.obstacle else options.number):
@@ -264,10 +263,10 @@ def in_ball(rng: np.random.Generator, radius: float, num: int) -> Array:
     return radius * rng.uniform(size=(num, 1)) ** (1 / 3) * direction
 
 
-def _on(task: Task, fraction: ArrayLike) -> Array:
-    """Points (*B, 3) of the mean demonstration at fractions (*B,) of its length, metres."""
+def _on(task: Task, fractions: Array) -> Array:
+    """Points (N, 3) of the mean demonstration at fractions (N,) of its length, metres."""
     path = task.mean_path
-    return interpolate(np.asarray(fraction) * (len(path) - 1), np.arange(len(path)), path)
+    return interpolate(fractions * (len(path) - 1), np.arange(len(path)), path)
 
 
 def _shaped(shape: str, centre: Array, sizes: Array, turn: Array | Quaternion) -> Obstacle:

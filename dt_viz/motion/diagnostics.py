@@ -63,7 +63,6 @@ def _of_motion(solved: Solved, drawn: DrawnSamples, robot: Robot | None) -> tupl
 
 
 def _of_arm(solved: Solved) -> list[MotionWarning]:
-    """Warnings about the way that the whole arm finds."""
     nominal, arm, avoidance, warnings = solved.nominal, solved.arm, solved.scenario.arm_avoidance, []
     assert arm is not None
     assert avoidance is not None
@@ -131,7 +130,6 @@ def margin_warnings(scenario: Scenario, nearest: Mapping[int, Nearest]) -> tuple
 
 
 def _of_integration(solved: Solved, robot: Robot | None) -> tuple[MotionWarning, ...]:
-    """Warnings about integrators that were chosen by hand."""
     stack, arm, avoidance = solved.stack, solved.arm, solved.scenario.arm_avoidance
     warnings, bundle = [], stack.bundle
     for level, applied in enumerate(stack.built, 1):

@@ -51,8 +51,8 @@ class Offer:
     """Other fields that its picture depends on, which is computed while the field is on; None where that is not."""
 
 
-def _offered(default: Any, *label_and_hint: str, **more: Any) -> Any:  # noqa: ANN401
-    return field(default=default, metadata={"offer": Offer(*label_and_hint, **more)})
+def _offered(default: Any, label: str = "", hint: str | None = None, **more: Any) -> Any:  # noqa: ANN401
+    return field(default=default, metadata={"offer": Offer(label, hint, **more)})
 
 
 @dataclass(frozen=True)

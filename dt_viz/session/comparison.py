@@ -54,7 +54,6 @@ class Comparison:
     """Motions of other methods, for one engine and on its thread; what an edit leaves unchanged is kept."""
 
     def __init__(self, follower: Follower, memo: Memo) -> None:
-        """Compare methods for this arm."""
         self._follower, self.memo = follower, memo
 
     def of(self, frame: Frame, learned: Learned, notes: Mapping[str, str] | None = None) -> tuple[Compared, ...]:
@@ -123,7 +122,7 @@ class Comparison:
         if isinstance(planner, str):
             return Compared(method, note=planner)
         try:
-            plan = planner.plan(obstacle, learned.task.starts, cancelled)
+            plan = planner(obstacle, learned.task.starts, cancelled)
         except UnreachableError as error:
             return Compared(method, note=str(error))
         stays = sum(len(path) < 2 for path in plan.paths)
@@ -148,7 +147,6 @@ class Comparison:
 
     @kept(NEWEST, by=lambda record, _, rollout: (record, rollout))
     def _arm(self, record: _Record, learned: Learned, rollout: int) -> ArmMotion:
-        """The arm's motion along a rollout of a method whose motions are planned."""
         known = record.known
         assert known is not None
         q, times = self._joints(known, learned, rollout), known.times[rollout]
@@ -207,7 +205,6 @@ def curves(path: Array, demonstration: Array, obstacle: Union) -> Array:
 
 
 def _tracked(num: int) -> Indices:
-    """Indices of the samples that the arm follows, of the `num` of a path."""
     return np.unique(arm_samples(num))
 
 

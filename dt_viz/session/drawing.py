@@ -126,7 +126,6 @@ class Drawing:
     """Makes the pictures of frames; what an edit leaves unchanged is kept."""
 
     def __init__(self, follower: Follower, memo: Memo) -> None:
-        """Draw motions of this arm."""
         self._follower, self.memo = follower, memo
 
     @kept(2, by=lambda frame, _, coarse: _seen(frame, coarse))
@@ -155,7 +154,6 @@ class Drawing:
         )
 
     def _carried(self, frame: Frame) -> FieldPicture:
-        """The hand's velocities, carried along by the whole arm's avoidance."""
         motion, robot = frame.motion, self._follower.robot
         assert motion.arm is not None
         postures = self._postures(frame, self._follower.reference(motion.nominal))
@@ -175,7 +173,6 @@ class Drawing:
 
     @kept(2, by=_stacked)
     def _velocities(self, frame: Frame) -> Array:
-        """See `velocities`."""
         return velocities(frame, self._learned_velocities(frame))
 
     @kept(2, by=_learned)

@@ -67,7 +67,7 @@ class Engine:
         self._last: dict[str, Solved] = {}
         """The last motion of each task: what is shown where a scenario has none."""
         self.own: dict[str, tuple[Task, FitStore]] = {}
-        """The visitor's own tasks by name, the oldest first, and what was learned from each: nobody else sees them."""
+        """The visitor's own tasks by name, the oldest first, and what was learned from each, for all of the engines."""
 
     def title(self, name: str) -> str:
         """Title of the task of that name."""
@@ -90,15 +90,10 @@ class Engine:
         number = max((int(name.rpartition("_")[2]) for name in self.own), default=0) + 1
         task = replace(task, name=f"{OWN}_{number}", title=f"Your data {number}" if number > 1 else "Your data")
         oldest = next((name for name in self.own if name != shown), None) if len(self.own) >= MOST_OWN else None
-        own = {name: kept for name, kept in self.own.items() if name != oldest}
-        self.adopt(own | {task.name: (task, FitStore(None))})
+        self.own[task.name] = task, FitStore(None)
+        if oldest is not None:
+            del self.own[oldest]
         return task, oldest
-
-    def adopt(self, own: dict[str, tuple[Task, FitStore]]) -> None:
-        """Take the visitor's own tasks as his engine for another arm has them."""
-        gone, self.own = self.own.keys() - own.keys(), own  # at once: others read it
-        for name in gone:
-            self._last.pop(name, None)
 
     def frames(
         self, scenario: Scenario, progress: Progress | None = None, cancelled: Cancelled = never
@@ -184,7 +179,6 @@ class Engine:
 
     @kept(NEWEST, by=lambda task: task)
     def _augmented(self, task: str) -> AugmentedImitation:
-        """The augmented imitation of a task's demonstrations."""
         of = self.task(task)
         return fit_augmented(of.demonstrations, settings=AugmentedSettings(preparation=of.preparation))
 
@@ -257,7 +251,8 @@ class Engine:
         admission = self._admission(scenario, precision)
         found = None if admission.blocked else self._solved(scenario, admission.nominal, precision)
         if found is not None and not found.blocked:
-            self._last[scenario.task] = found
+            known = {name: last for name, last in self._last.items() if name in self.own or name in self._tasks}
+            self._last = known | {scenario.task: found}
             return Frame(scenario, Stage.ROLLOUTS, found, *self._drawn(found))
         blocked = admission.blocked if found is None else found.blocked
         free = replace(scenario, stack=_without_obstacles(scenario.stack))
@@ -345,6 +340,5 @@ class Engine:
 
 
 def _without_obstacles(stack: tuple[Layer, ...]) -> tuple[Layer, ...]:
-    """The stack with all that avoids switched off."""
     avoids = [isinstance(layer.transform, Avoidance) or bool(layer.transform.avoided.parts) for layer in stack]
     return tuple(replace(layer, on=layer.on and not off) for layer, off in zip(stack, avoids, strict=True))

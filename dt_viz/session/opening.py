@@ -156,7 +156,6 @@ def _moved(seen: Preview, fits: Placement) -> Preview:
 
 
 def _copied(take: Take) -> Take:
-    """A take whose units may be changed in place."""
     copies = {name: np.array(value) for name in ("positions", "joints") if (value := getattr(take, name)) is not None}
     return replace(take, **copies)
 

@@ -56,7 +56,6 @@ class LiveArm:
     """
 
     def __init__(self, follower: Follower, settings: RoundSettings | None = None) -> None:
-        """Take an arm; it begins to move once it has something to follow."""
         self._follower = follower
         self._settings = sized(settings or RoundSettings(), follower.robot.size)
         self._changing = threading.Lock()

@@ -160,7 +160,7 @@ class Session:
 
     def bring(self, task: Task) -> tuple[Task, str | None]:
         """Take a task of the visitor's own, to be chosen; see `Engine.bring`."""
-        own, gone = self.engines.bring(task, self.scenario)
+        own, gone = self.engine.bring(task, self.scenario.task)
         if gone is not None:
             with self._lock:
                 self._history.forget(gone)
@@ -293,12 +293,10 @@ class Session:
         self._adopt()
 
     def _adopt(self) -> None:
-        """Show the newest scenario on the controls."""
         self._unadopted = False
         self._screen.adopt(lambda: self.scenario)
 
     def _catch_up(self) -> None:
-        """Show what a drag has edited."""
         if self._unadopted:
             self._adopt()
 

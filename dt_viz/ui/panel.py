@@ -148,7 +148,6 @@ class ControlPanel:
         )
 
     def _learn(self, session: Session, task: Task) -> None:
-        """Begin with a task of the visitor's own."""
 
         def begin(session: Session, _title: str) -> None:
             own, gone = session.bring(task)

@@ -24,12 +24,12 @@ from dt_viz.session.progress import Display, Pace, Progress
 from dt_viz.session.session import Session
 from dt_viz.ui.panel import ControlPanel
 from dt_viz.ui.playback import Playback
-from dt_viz.ui.ruler import Ruler
 from dt_viz.ui.scene.camera import CameraController
 from dt_viz.ui.scene.export import RESOLUTIONS, render_png
 from dt_viz.ui.scene.palette import DARK, LIGHT, Colour, Theme
 from dt_viz.ui.scene.robot_scene import RobotScene
 from dt_viz.ui.scene.scene import ScenePictures
+from dt_viz.ui.scripts import Ruler
 
 
 def initial_scenario(engine: Engine, name: str) -> Scenario:
@@ -93,7 +93,7 @@ class Visitor(Display):
         self.client.gui.add_html(self.ruler.html)
 
     def measured(self, width: float) -> None:
-        """Take the width that the window has at least, CSS pixels."""
+        """Take the width of the window, CSS pixels."""
         self._camera.measured(width)
 
     def draw(self, frame: Frame, pace: Pace) -> None:
@@ -144,7 +144,6 @@ class Visitor(Display):
         self.client.flush()
 
     def _pose(self) -> None:
-        """Draw the scene a moment later."""
         now = time.monotonic()
         self._camera.turn(now)
         with self._exchanging:
@@ -166,7 +165,6 @@ class Visitor(Display):
         self._camera.reframe(arm_size=robot.size)
 
     def _dress(self, theme: Theme) -> None:
-        """Show the panel in a theme."""
         self._theme = theme
         self.client.gui.configure_theme(
             dark_mode=theme is DARK, show_logo=False, show_share_button=False, brand_color=LIGHT.brand
@@ -178,7 +176,6 @@ class Visitor(Display):
         self._paint(self._theme)
 
     def _paint(self, theme: Theme) -> None:
-        """Show the scene in a theme."""
         with self.client.atomic(), self._exchanging:
             self.pictures.paint(theme)
             self.robot.paint(theme)

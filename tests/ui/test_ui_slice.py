@@ -18,13 +18,12 @@ from dt_viz.scenario.slices import SlicePose
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.frame import Stage
 from dt_viz.ui.scene.colour_scale import NUM_SHADES, from_oklab, oklab, ramp
+from dt_viz.ui.scene.draggables import MovableSlice, Obstacles
 from dt_viz.ui.scene.export import as_png
 from dt_viz.ui.scene.legend import OCCUPANCY, legend_of
-from dt_viz.ui.scene.obstacles import Obstacles
 from dt_viz.ui.scene.palette import LIGHT, css
 from dt_viz.ui.scene.picture import Look
 from dt_viz.ui.scene.rollouts import Rollouts
-from dt_viz.ui.scene.slice import MovableSlice
 from dt_viz.ui.scene.slice_layers import (
     OPACITY,
     VOLUME,

@@ -45,7 +45,6 @@ class ComparePanel:
     """Controls of the comparison, its table, and figure 6 of the paper for one motion."""
 
     def __init__(self, gui: viser.GuiApi, bindings: Bindings) -> None:
-        """Build the controls in the tab that is open."""
         self._drawn: tuple[str, ...] = ()
         """Names of the methods in the plots."""
         with gui.add_folder("Methods"):  # closed by a click, so that the table is seen at once on a small screen

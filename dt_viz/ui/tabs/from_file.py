@@ -44,14 +44,14 @@ def has_room(scenario: Scenario) -> bool:
 
 
 @contextmanager
-def turn(wait: Callable[[], None], left: Cancelled) -> Iterator[None]:
-    """Wait until no other visitor's file is being read, and read within the block; call `wait` if that takes time.
+def turn(say: Callable[[str, Severity], None], left: Cancelled) -> Iterator[None]:
+    """Wait until no other visitor's file is being read, which is said, and read within the block.
 
     Raises:
         UnwantedError: the visitor has left, before the block or within it.
     """
     if not _one_file.acquire(blocking=False):
-        wait()
+        say("Another visitor's file is being read; yours is read after it.", Severity.WARNING)
         while not _one_file.acquire(timeout=0.1):  # the visitor may leave meanwhile
             end_if(left)
     try:
@@ -99,13 +99,12 @@ class FileLoader:
         """
         session, self._refused, self._upload.disabled = self._bindings.session, None, True
         left = partial(session.jobs.superseded, LANE)
-        wait = "Another visitor's file is being read; yours is read after it."
         try:
             if not has_room(session.scenario):
                 raise ShapeError(
                     name, "scene", f"{MAX_OBSTACLES} obstacles", f"at most {MAX_OBSTACLES}: delete one first"
                 )
-            with turn(partial(session.say, wait, Severity.WARNING), left):
+            with turn(session.say, left):
                 obstacle, notes = from_file(content, name, scale, left)
             self._add(session, obstacle)
             if notes:

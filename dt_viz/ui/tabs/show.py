@@ -37,7 +37,6 @@ class ShowTab:
     """The controls of one visitor's tab."""
 
     def __init__(self, gui: viser.GuiApi, bindings: Bindings) -> None:
-        """Build the controls where the panel is being built."""
         self._bindings = bindings
         self.legend: Legend | None = None
         """Legend of the colours that are shown on the slice."""

@@ -66,7 +66,6 @@ class StackPanel:
     """The stack, a row for each transform."""
 
     def __init__(self, gui: viser.GuiApi, bindings: Bindings) -> None:
-        """Build an empty list, the warp and the settings."""
         self._gui, self._bindings = gui, bindings
         bindings.properties(gui.add_html(""), content=formula_html)
         self._folder = gui.add_folder("Stack, the outermost on top")
@@ -82,7 +81,7 @@ class StackPanel:
 
     def _wanted(self, scenario: Scenario) -> tuple[StackRow, ...]:
         frame = self._bindings.frame
-        return rows(scenario, {} if frame is None else durations(frame))
+        return rows(scenario, {} if frame is None else frame.durations)
 
     def _show(self, wanted: tuple[StackRow, ...]) -> None:
         """Reuse the rows that there are, from the top; those that are not needed are hidden."""
@@ -106,7 +105,7 @@ def press(session: Session, name: str, button: str) -> None:
     session.step(f"{name} {button}", **_ACTIONS[button](session.scenario, name))
 
 
-def rows(scenario: Scenario, durations: Mapping[str, float | None]) -> tuple[StackRow, ...]:
+def rows(scenario: Scenario, durations: Mapping[str, float]) -> tuple[StackRow, ...]:
     """Return the rows from the top down, with the durations of the last frame."""
     on = {layer.name for layer in scenario.stack if layer.on}
     seen, order, rows = levels(scenario), listed(scenario), []
@@ -123,12 +122,6 @@ def rows(scenario: Scenario, durations: Mapping[str, float | None]) -> tuple[Sta
     imitation = StackRow(IMITATION, IMITATION, (ON if scenario.imitation else OFF, _look(scenario, IMITATION)))
     base = StackRow(BASE, BASE, (SHOWN if BASE_PANEL in scenario.view.panels else SHOW,))
     return (*reversed(rows), imitation, base)
-
-
-def durations(frame: Frame) -> dict[str, float | None]:
-    """Return t of the flow of each transform, by name; None where it is off."""
-    layers = zip(frame.scenario.stack, frame.durations, strict=False)
-    return {**{layer.name: duration for layer, duration in layers}, WHOLE_ARM: frame.arm_duration}
 
 
 def legend_html(scenario: Scenario) -> str:

@@ -158,13 +158,11 @@ def delete(session: Session) -> None:
 
 
 def _replace(session: Session, obstacles: tuple[Obstacle, ...], selected: int) -> None:
-    """Replace the obstacles, as one step for undo."""
     view = replace(session.scenario.view, selected=selected)
     session.step("obstacles", stack=with_avoidance(session.scenario, obstacles=obstacles), view=view)
 
 
 def _names(scenario: Scenario) -> tuple[str, ...]:
-    """Return the numbers and shapes of the obstacles."""
     return tuple(f"{k}: {name_of(obstacle)}" for k, obstacle in enumerate(scenario.obstacles, 1)) or (NONE,)
 
 
