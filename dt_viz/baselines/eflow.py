@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from dt_viz.baselines.base import Plan, Planner, Problem
-from dt_viz.baselines.weights import FOLDER, check_shapes, load_weights
+from dt_viz.baselines.weights import FOLDER, load_weights
 from dt_viz.errors import Cancelled, never
 from dt_viz.flows.diffeomorphisms import Chain, Diffeomorphism, Placed
 from dt_viz.flows.fields import Array, Indices
@@ -192,23 +192,8 @@ class EFlowSystem:
             task: the task that they were trained for.
             arrays: as `dt_viz.baselines.eflow_training.train` returns them.
             precision: numpy type that the cosines are computed in; single costs less than a micrometre.
-
-        Raises:
-            NotFittedError: an array is missing, or of another shape.
         """
-        dim, num_hidden = task.demonstrations[0].dimension, ARCHITECTURE.num_hidden
-        features = (ARCHITECTURE.num_blocks, 2, ARCHITECTURE.num_features)
-        shapes = {
-            "frequencies": (*features, (dim + 1) // 2),
-            "phases": features,
-            "weights": (*features, (dim + 1) // 2),
-            "normalisation": (2, dim),
-            "goal": (dim,),
-            "speed_0": (num_hidden, dim + 1),
-            "speed_1": (num_hidden, num_hidden + 1),
-            "speed_2": (1, num_hidden + 1),
-        }
-        check_shapes("eflow", arrays, shapes)
+        dim = task.demonstrations[0].dimension
         couplings = [
             Coupling.of(a, b, W[..., : num_of(a, dim)], phases, w[..., : num_of(b, dim)])
             for (a, b), W, phases, w in zip(

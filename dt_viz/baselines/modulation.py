@@ -53,18 +53,15 @@ def gamma(obstacle: Obstacle, distance: Array) -> Array:
     return (1 + np.maximum(distance, 0) / obstacle.depth) ** 2
 
 
-def modulated(obstacle: Union, y: Array, v: Array) -> tuple[Array, Array]:
-    """Velocities `v` (N, 3), m/s, at `y` (N, 3), metres, as the obstacles modulate them.
+def modulated(obstacle: Union, y: Array, v: Array) -> Array:
+    """Return velocities `v` (N, 3), m/s, at `y` (N, 3), metres, as the obstacles modulate them.
 
     Where a velocity leads away from an obstacle, λ_r is 1 (the tail effect). Several obstacles are weighted by how near
     each is, so that on the surface of one it alone counts.
-
-    Returns:
-        Velocities (N, 3), m/s, and the distances (N,), metres, from the nearest obstacle.
     """
     if not obstacle.parts:
-        return v, np.full(len(y), np.inf)
-    velocities, gammas, distances = [], [], []
+        return v
+    velocities, gammas = [], []
     for part in obstacle.parts:
         distance, n = Union((part,)).distance_and_normal(y)
         r = unit(y - np.array(part.position))
@@ -75,12 +72,11 @@ def modulated(obstacle: Union, y: Array, v: Array) -> tuple[Array, Array]:
         radial = np.where(towards >= 0, 1.0, 1 - near) * along_r
         velocities.append(radial[:, None] * r + (1 + near)[:, None] * tangential)
         gammas.append(near)
-        distances.append(distance)
     far = 1 / np.array(gammas) - 1  # (parts, N), zero on the surface
     weights = np.array([np.prod(np.delete(far, k, axis=0), axis=0) for k in range(len(far))])
     total = weights.sum(axis=0)
     weights = np.where(total > 0, weights / np.where(total > 0, total, 1), 1 / len(far))
-    return np.einsum("pn,pnd->nd", weights, np.array(velocities)), np.min(distances, axis=0)
+    return np.einsum("pn,pnd->nd", weights, np.array(velocities))
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +132,7 @@ class _Planner:
         y, D = self.system.transform.inverse_jacobian(z)
         offset = self.system.base.goal - z
         nominal = np.einsum("nij,nj->ni", D, unit(offset))
-        v, _ = modulated(obstacle, y, nominal)
+        v = modulated(obstacle, y, nominal)
         speed = np.linalg.norm(v, axis=1) + self.settings.slowest * np.linalg.norm(nominal, axis=1)
         step = np.tanh(np.linalg.norm(offset, axis=1) / self.settings.approach) / divisor(speed)
         return y, step[:, None] * np.linalg.solve(D, v[..., None])[..., 0], step

@@ -23,7 +23,7 @@ import numpy as np
 
 from dt_viz.baselines.base import NotFittedError, Plan, Planner, Problem
 from dt_viz.baselines.postures import PlanningScene, Query, planned
-from dt_viz.baselines.weights import FOLDER, check_shapes, load_weights
+from dt_viz.baselines.weights import FOLDER, load_weights
 from dt_viz.errors import Cancelled, end_if, never
 from dt_viz.flows.fields import Array
 from dt_viz.obstacles.union import Union
@@ -63,18 +63,21 @@ ARCHITECTURE = MPNetSettings()
 class Network:
     """Linear layers with parametric rectifiers between them, and dropout after the first of these."""
 
-    weights: tuple[Array, ...]
+    weights: Sequence[Array]
     """Of each layer, (out, in)."""
-    biases: tuple[Array, ...]
+    biases: Sequence[Array]
     slopes: Array
     """Slope of the rectifier after each layer but the last, below zero."""
+    centre: Array
+    """(n,) rad, the postures' place in the network's unit."""
+    scale: Array
+    """(n,) rad for one such unit."""
 
     @classmethod
     def of(cls, arrays: Mapping[str, Array]) -> Network:
-        """Make the network of arrays ``W_k``, ``c_k`` and ``slopes``."""
-        layers = range(len(arrays["slopes"]) + 1)
-        weights, biases = (tuple(arrays[f"{kind}_{k}"] for k in layers) for kind in "Wc")
-        return cls(weights, biases, arrays["slopes"])
+        """Make the network of arrays as `dt_viz.baselines.mpnet_training.train` returns them."""
+        weights, biases = ([arrays[f"{kind}_{k}"] for k in range(len(arrays["slopes"]) + 1)] for kind in "Wc")
+        return cls(weights, biases, arrays["slopes"], arrays["centre"], arrays["scale"])
 
     def masks(self, rng: np.random.Generator, num: int) -> list[Array]:
         """Factors (num, out) for the outputs of the first layers: 0 for neurons that are left out, else 1/(1 − p)."""
@@ -93,40 +96,10 @@ class Network:
                 x = x * masks[k]
         return inputs, sums
 
-
-@dataclass(frozen=True, eq=False)
-class MPNetModel:
-    """Planning network of one task."""
-
-    planning: Network
-    centre: Array
-    """(n,) rad, the postures' place in the network's unit."""
-    scale: Array
-    """(n,) rad for one such unit."""
-
-    @classmethod
-    def of(cls, arrays: Mapping[str, Array], num_joints: int) -> MPNetModel:
-        """Make the network that weights describe, as `dt_viz.baselines.mpnet_training.train` returns them.
-
-        Raises:
-            NotFittedError: an array is missing, or of another shape.
-        """
-        shapes: dict[str, tuple[int, ...]] = {"centre": (num_joints,), "scale": (num_joints,)}
-        for k, (num_in, num_out) in enumerate(pairwise(ARCHITECTURE.widths(num_joints))):
-            shapes |= {f"W_{k}": (num_out, num_in), f"c_{k}": (num_out,)}
-        check_shapes("mpnet", arrays, shapes | {"slopes": (len(ARCHITECTURE.hidden),)})
-        return cls(Network.of(arrays), arrays["centre"], arrays["scale"])
-
     def next(self, q: Array, goal: Array, rng: np.random.Generator) -> Array:
-        """The next posture (n,), rad, on the way from q (n,) to a goal (n,).
-
-        Args:
-            q: posture, rad.
-            goal: posture, rad.
-            rng: draws the neurons that are left out.
-        """
+        """The next posture (n,), rad, on the way from q (n,) to a goal (n,); `rng` draws the neurons left out."""
         x = np.concatenate([(q - self.centre) / self.scale, (goal - self.centre) / self.scale])
-        _, sums = self.planning.traced(x[None], self.planning.masks(rng, 1))
+        _, sums = self.traced(x[None], self.masks(rng, 1))
         return self.centre + self.scale * sums[-1][0]
 
 
@@ -138,7 +111,7 @@ Replan = Callable[["Search", Array, Array], list[Array]]
 class Search:
     """The search for one motion."""
 
-    model: MPNetModel
+    model: Network
     surroundings: PlanningScene
     rng: np.random.Generator
     cancelled: Cancelled = never
@@ -203,12 +176,12 @@ class MPNetPlanner:
     """MPNet for one task; see `Planner`."""
 
     problem: Problem
-    model: MPNetModel
+    model: Network
     replan: Replan | None
 
     def __call__(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
         """Plan around an obstacle as far as that succeeds; see `Planner`."""
-        surroundings = PlanningScene.of(self.problem.robot, obstacle)
+        surroundings = PlanningScene(self.problem.robot, obstacle)
         queries, ways, warnings = [], [], []
         for number, start in enumerate(starts):
             query = Query.of(self.problem, start)
@@ -234,5 +207,4 @@ def fit(problem: Problem, replan: Replan | None = None, folder: Path = FOLDER) -
     """
     if problem.robot.name != TRAINED_FOR:
         raise NotFittedError(f"trained for the {TRAINED_FOR.upper()} only")
-    arrays = load_weights("mpnet", VERSION, problem.task, folder)
-    return MPNetPlanner(problem, MPNetModel.of(arrays, problem.robot.num_joints), replan)
+    return MPNetPlanner(problem, Network.of(load_weights("mpnet", VERSION, problem.task, folder)), replan)

@@ -96,11 +96,11 @@ def _planned(
     setup.setStateValidityChecker(lambda state: is_free(posture(state), posture(state)))
     information.setMotionValidator(motions)
     setup.setPlanner(geometric.RRTConnect(information))
-    ends = space.allocState(), space.allocState()
-    for state, q in zip(ends, (start, goal), strict=True):
+    states: Any = space.allocState(), space.allocState()
+    for state, q in zip(states, (start, goal), strict=True):
         for joint, angle in enumerate(q):
             state[joint] = float(angle)  # copyFromReals of ompl 2.0.1 crashes
-    setup.setStartAndGoalStates(*ends)
+    setup.setStartAndGoalStates(*states)
     setup.solve(base.PlannerTerminationCondition(is_over))
     if not setup.haveExactSolutionPath():
         return []

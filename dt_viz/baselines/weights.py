@@ -80,14 +80,6 @@ def weights_file(folder: Path, method: str, task: Task) -> Path:
     return folder / f"{method}_{task.name}.npz"
 
 
-def check_shapes(method: str, arrays: Mapping[str, Array], shapes: Mapping[str, tuple[int, ...]]) -> None:
-    """Raise NotFittedError if a method's array is missing, or of another shape."""
-    for name, shape in shapes.items():
-        found = arrays[name].shape if name in arrays else "nothing"
-        if found != shape:
-            raise NotFittedError(f"{method}: array {name!r}: found {found}; accepted: {shape}")
-
-
 def _stamp(method: str, version: int, task: Task) -> dict[str, str | int]:
     """What a file says about itself: method, version, and a digest of the task's demonstrations."""
     return {"_method": method, "_version": version, "_demonstrations": fingerprint(task.demonstrations, "weights")}

@@ -48,11 +48,10 @@ def run_command(package: str, commands: Sequence[str], arguments: Sequence[str],
     # numerical libraries read these when they are first imported; one thread is how the figures compare
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
-    from dt_viz.errors import DataError  # noqa: PLC0415
+    from dt_viz.errors import DataError, FormatError  # noqa: PLC0415
     from dt_viz.evaluate.options import (  # noqa: PLC0415
         PRINTED,
         TABLES,
-        InputError,
         ready_to_write,
         with_negative_values,
         write_tables,
@@ -82,7 +81,7 @@ def run_command(package: str, commands: Sequence[str], arguments: Sequence[str],
         if tables is not None:
             write_tables(tables)
         return status
-    except (DataError, ImitationError, InputError) as error:
+    except (DataError, ImitationError, FormatError) as error:
         print(f"{prog} {options.command}: {error}", file=sys.stderr)
         return BAD_INPUT
 

@@ -156,7 +156,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run the command; 1 if the one obstacle that was asked for leaves no motion."""
     tasks, task = chosen_task(options)
-    out, engine = options.out, new_engine(tasks)
+    engine = new_engine(tasks)
     try:
         chosen = {"space": options.space, "generator": options.generator}
         avoided = (Avoidance(obstacles, **chosen) for obstacles in _obstacles(task, options))
@@ -174,7 +174,7 @@ def run(options: argparse.Namespace) -> int:
         for i, motion in one.motions.items():
             x = engine.follower.robot.end_effector(motion.q)
             arrays |= {f"q_{i}": motion.q, f"times_{i}": motion.times, f"x_{i}": x, f"demo_{i}": task.paths[i]}
-    write_npz(out, **arrays)
+    write_npz(options.out, **arrays)
     who = {"task": "the end effector", "cspace": "the whole arm"}[options.space]
     avoids = "nothing" if options.no_avoidance else who
     print(f"{task.name}, {avoids} avoids; worst rollout of each row, clearances negative inside")

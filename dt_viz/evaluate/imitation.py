@@ -36,10 +36,11 @@ from typing import Any
 
 import numpy as np
 
+from dt_viz.errors import FormatError
 from dt_viz.evaluate import figures
 from dt_viz.evaluate.figures import FigurePanel
 from dt_viz.evaluate.held_out import WAYS, Followed, Learn, degrees_off, follow, frechet, rollouts_from
-from dt_viz.evaluate.options import FOLDER, InputError, report, whole_number, write_json, write_npz
+from dt_viz.evaluate.options import FOLDER, report, whole_number, write_json, write_npz
 from dt_viz.files.archives import LASA_UNITS
 from dt_viz.flows.diffeomorphisms import min_det_jacobian, round_trip_error
 from dt_viz.flows.fields import Array
@@ -89,13 +90,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run the command; 2 if one of the shapes could not be fitted."""
     if options.state == "augmented" and options.objective != OBJECTIVES[0]:
-        raise InputError("--objective", options.objective, "none with --state augmented, whose fit has no objective")
+        raise FormatError("--objective", options.objective, "none with --state augmented, whose fit has no objective")
     learn: Learn = partial(learn_in_state, settings=ImitationSettings(options.objective), state=options.state)
     sources = _sources(options.files, options.rate, options.unit)
     holds_out = options.leave_one_out or options.folds is not None
     alone = ", ".join(str(source.path) for source in sources if len(source.demonstrations) == 1)
     if holds_out and alone:
-        raise InputError("--leave-one-out", f"one demonstration only in {alone}", "two or more in each")
+        raise FormatError("--leave-one-out", f"one demonstration only in {alone}", "two or more in each")
     folder = options.out
     shapes: list[dict[str, Any]] = []
     held_out: list[dict[str, Any]] = []
@@ -277,7 +278,7 @@ def _sources(paths: Sequence[Path], rate: float | None, unit: str | None) -> lis
     for path in paths:
         if path.stem in sources:
             found = f"{str(sources[path.stem].path)!r} and {str(path)!r}, which would both become {path.stem}.npz"
-            raise InputError("SHAPE", found, "files of different names")
+            raise FormatError("SHAPE", found, "files of different names")
         size = LASA_UNITS["length"] if path.suffix.lower() == ".mat" else 1.0
         sources[path.stem] = Source(path, load_demonstrations(path, rate=rate, unit=unit), size)
     return list(sources.values())

@@ -42,8 +42,8 @@ from typing import Any
 
 import numpy as np
 
+from dt_viz.errors import FormatError
 from dt_viz.evaluate.options import (
-    InputError,
     Row,
     add_lasa,
     chosen_task,
@@ -273,7 +273,7 @@ def _server(options: argparse.Namespace, number: int) -> Iterator[tuple[str, int
             found = (re.search(r"DT-Viz is at http://(\S+)", line) for line in process.stdout)
             address = next((match[1] for match in found if match), None)
             if address is None:
-                raise InputError("--task", "a server that does not start", "one that does: see above")
+                raise FormatError("--task", "a server that does not start", "one that does: see above")
             yield f"ws://{address}", process.pid
         finally:
             process.terminate()

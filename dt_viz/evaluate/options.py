@@ -15,6 +15,7 @@ import numpy as np
 
 from dt_viz.avoidance.hand import Avoidance
 from dt_viz.avoidance.registry import AVOIDANCE
+from dt_viz.errors import FormatError
 from dt_viz.folders import default_cache_folder
 from dt_viz.learning.store import FitStore
 from dt_viz.robot.models import load_arm
@@ -33,13 +34,6 @@ PRINTED: list[Sequence[Row]] = []
 """Tables that the running command has printed."""
 
 
-class InputError(ValueError):
-    """A request on the command line that cannot be met."""
-
-    def __init__(self, field: str, found: str, accepted: str) -> None:
-        super().__init__(f"{field}: found {found}; accepted: {accepted}")
-
-
 def add_task(parser: argparse.ArgumentParser) -> None:
     """Add `--task` and `--lasa`."""
     parser.add_argument("--task", required=True, help=f"{', '.join(TASKS)}, or a file of --lasa without its suffix")
@@ -55,13 +49,13 @@ def chosen_task(options: argparse.Namespace) -> tuple[Mapping[str, TaskEntry], T
     """Return all tasks by name, and the chosen one, loaded.
 
     Raises:
-        InputError: there is none of this name.
+        FormatError: there is none of this name.
         DemonstrationError: the folder or the task's file cannot be used.
     """
     tasks = known_tasks(options.lasa)
     if options.task not in tasks:
         hint = "" if options.lasa is not None else "; --lasa DIR adds more"
-        raise InputError("--task", repr(options.task), ", ".join(tasks) + hint)
+        raise FormatError("--task", repr(options.task), ", ".join(tasks) + hint)
     return tasks, tasks[options.task]()
 
 
@@ -141,11 +135,11 @@ def ready_to_write(path: Path, form: str) -> Path:
         form: `FOLDER`, or "FILE" with the suffix that it has to have.
 
     Raises:
-        InputError: it has another suffix, is a folder where a file is wanted, or cannot be written.
+        FormatError: it has another suffix, is a folder where a file is wanted, or cannot be written.
     """
     suffix = "" if form == FOLDER else Path(form).suffix
     if path.suffix.lower() != suffix and form != FOLDER:
-        raise InputError("--out", repr(str(path)), f"a file that ends in {suffix}")
+        raise FormatError("--out", repr(str(path)), f"a file that ends in {suffix}")
     try:
         (path.parent if suffix else path).mkdir(parents=True, exist_ok=True)
         if suffix and not path.exists():
@@ -155,7 +149,7 @@ def ready_to_write(path: Path, form: str) -> Path:
             path.open("ab").close()
     except OSError as error:
         found = f"{str(path)!r}, which cannot be written ({error.strerror or error})"
-        raise InputError("--out", found, "a file or folder that can be written") from error
+        raise FormatError("--out", found, "a file or folder that can be written") from error
     return path
 
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from itertools import cycle
 from typing import Any
@@ -83,33 +83,6 @@ TICK = SETTINGS.tick
 
 
 @dataclass(frozen=True, eq=False)
-class Passage:
-    """An obstacle that passes."""
-
-    path: Array
-    """(N, 3) evenly spaced places of its centre, metres."""
-    comes: float
-    """Time at which it comes, seconds."""
-    length: float
-    """Length of the path, metres."""
-    speed: float
-    """m/s."""
-    wxyz: Quaternion = UPRIGHT
-
-    @property
-    def gone(self) -> float:
-        """Time after which it is not there any more, seconds."""
-        return self.comes + self.length / self.speed
-
-    def at(self, t: float) -> Array:
-        """(3,) its centre, metres; NaN where it is not there."""
-        if not self.comes <= t < self.gone:
-            return np.full(3, np.nan)
-        place = (t - self.comes) * self.speed / self.length * (len(self.path) - 1)
-        return interpolate(np.array([place]), np.arange(len(self.path)), self.path)[0]
-
-
-@dataclass(frozen=True, eq=False)
 class Crossing:
     """Obstacles that cross a motion."""
 
@@ -117,16 +90,13 @@ class Crossing:
     """Rollout that the robot follows."""
     begins: float
     """Time at which the robot sets out, seconds."""
-    passages: tuple[Passage, ...]
+    places: Array
+    """(T, P, 3) centres of the obstacles at each tick until all are gone, metres; NaN for those that are not there."""
+    wxyz: Sequence[Quaternion]
 
-    @property
-    def gone(self) -> float:
-        """Time after which there is no obstacle, seconds."""
-        return max(passage.gone for passage in self.passages)
-
-    def at(self, t: float) -> Array:
+    def at(self, tick: int) -> Array:
         """(P, 3) the centres, metres; NaN for those that are not there."""
-        return np.stack([passage.at(t) for passage in self.passages])
+        return self.places[tick] if tick < len(self.places) else np.full_like(self.places[0], np.nan)
 
 
 @dataclass
@@ -134,9 +104,7 @@ class Run:
     """What happened."""
 
     q: list[Array] = field(default_factory=list)
-    t: list[float] = field(default_factory=list)
-    obstacle: list[Array] = field(default_factory=list)
-    """(P, 3) centres of the obstacles, metres."""
+    """(n,) joint angles at each tick, rad."""
     ticks: list[float] = field(default_factory=list)
     """Processor times of the ticks, seconds."""
     phases: set[Phase] = field(default_factory=set)
@@ -160,10 +128,10 @@ class Bench:
             return Box(as_point(place), (a, b, c), wxyz)
         return Sphere(as_point(place), self.diameter)
 
-    def obstacles(self, crossing: Crossing, t: float) -> tuple[Obstacle, ...]:
-        """Those that are there at a time."""
-        places = zip(crossing.passages, crossing.at(t), strict=True)
-        return tuple(self.shape(place, passage.wxyz) for passage, place in places if np.isfinite(place[0]))
+    def obstacles(self, crossing: Crossing, tick: int) -> tuple[Obstacle, ...]:
+        """Those that are there at a tick."""
+        places = zip(crossing.at(tick), crossing.wxyz, strict=True)
+        return tuple(self.shape(place, wxyz) for place, wxyz in places if np.isfinite(place[0]))
 
     def undisturbed(self, start: int) -> tuple[Array, Array]:
         """The hand's places (T, 3), metres, and joints (T, n) at all ticks without a sphere."""
@@ -188,13 +156,22 @@ def crossings(bench: Bench, speed: float, seed: int, num: int = 1) -> Iterator[t
     for start in cycle(range(len(bench.starts))):
         hand, joints = undisturbed(start)
         drawn = [_drawn(bench, hand, joints, speed, rng) for _ in range(num)]
-        begins = max(0.0, *(-passage.comes for passage in drawn))
-        passages = (replace(passage, comes=passage.comes + begins) for passage in drawn)
-        yield Crossing(start, begins, tuple(passages)), TICK * len(hand)
+        begins = max(0.0, *(-comes for comes, _, _ in drawn))
+        durations = [arc_length(path)[-1] / speed for _, path, _ in drawn]
+        gone = [begins + comes + duration for (comes, *_), duration in zip(drawn, durations, strict=True)]
+        t = TICK * np.arange(np.ceil(max(gone) / TICK))
+        places = np.full((len(t), num, 3), np.nan)
+        for n, (comes, path, _) in enumerate(drawn):
+            there = (begins + comes <= t) & (t < gone[n])
+            passed = (t[there] - begins - comes) / durations[n]
+            places[there, n] = interpolate(passed, np.linspace(0, 1, len(path)), path)
+        yield Crossing(start, begins, places, [wxyz for *_, wxyz in drawn]), TICK * len(hand)
 
 
-def _drawn(bench: Bench, hand: Array, joints: Array, speed: float, rng: np.random.Generator) -> Passage:
-    """Draw an obstacle that is at the hand at some tick, its time from when the robot sets out.
+def _drawn(
+    bench: Bench, hand: Array, joints: Array, speed: float, rng: np.random.Generator
+) -> tuple[float, Array, Quaternion]:
+    """Draw an obstacle that will be at the hand: when it comes, s after the robot sets out, its path (N, 3), its turn.
 
     Args:
         bench: its robot.
@@ -217,7 +194,7 @@ def _drawn(bench: Bench, hand: Array, joints: Array, speed: float, rng: np.rando
             and room.min() >= SETTINGS.pedestal_room
             and body.clearance(passing[None], first)[0] >= SETTINGS.start_room
         ):
-            return Passage(path, at * TICK - length / 2 / speed, length, speed, first.wxyz)
+            return at * TICK - length / 2 / speed, path, first.wxyz
 
 
 def _path(middle: Array, rng: np.random.Generator) -> Array:
@@ -237,17 +214,15 @@ def simulated(bench: Bench, crossing: Crossing) -> Run:
     controller.begin(q, crossing.start)
     controller.home(crossing.start)
     looks, went, present = 0.0, False, True
-    for k in range(int((crossing.gone + crossing.begins + SETTINGS.longest) / TICK)):
+    for k in range(len(crossing.places) + int((crossing.begins + SETTINGS.longest) / TICK)):
         t = k * TICK
         run.q.append(q)
-        run.t.append(t)
-        run.obstacle.append(crossing.at(t))
-        if t > crossing.gone and went and not present and controller.phase is Phase.RESTING:
+        if k >= len(crossing.places) and went and not present and controller.phase is Phase.RESTING:
             break
         if not went and t >= crossing.begins:
             controller.go()
             went = True
-        parts = bench.obstacles(crossing, t)
+        parts = bench.obstacles(crossing, k)
         if t >= looks and (parts or present):
             present, looks = bool(parts), t + SETTINGS.look_period
             controller.see(ArmAvoidance(parts, margin=bench.margin))
@@ -260,29 +235,24 @@ def simulated(bench: Bench, crossing: Crossing) -> Run:
 
 def room_at_coming(bench: Bench, run: Run, crossing: Crossing) -> float:
     """Smallest distance of the arm from an obstacle at the tick at which that comes, metres."""
-    body, centres = bench.follower.whole_arm, np.array(run.obstacle)
-    ticks = np.isfinite(centres[:, :, 0]).argmax(axis=0)
-    there = zip(ticks, crossing.passages, strict=True)
-    return min(
-        float(body.clearance(run.q[k][None], bench.shape(centres[k, n], passage.wxyz))[0])
-        for n, (k, passage) in enumerate(there)
-    )
+    ticks = np.isfinite(crossing.places[:, :, 0]).argmax(axis=0)
+    coming = [(run.q[k][None], bench.shape(crossing.places[k, n], crossing.wxyz[n])) for n, k in enumerate(ticks)]
+    return min(float(bench.follower.whole_arm.clearance(q, obstacle)[0]) for q, obstacle in coming)
 
 
 def smallest_distance(bench: Bench, run: Run, crossing: Crossing) -> float:
     """Smallest distance of the arm's meshes from the obstacles, at the ticks and at five places between two, metres."""
     cover, model, best = bench.robot.body, bench.robot.collision, np.inf
-    for passage, centres in zip(crossing.passages, np.array(run.obstacle).transpose(1, 0, 2), strict=True):
+    for wxyz, centres in zip(crossing.wxyz, crossing.places.transpose(1, 0, 2), strict=True):
         (there,) = np.nonzero(np.isfinite(centres[:, 0]))
         finely = np.linspace(there[0], there[-1], 6 * (len(there) - 1) + 1)
         q, places = (interpolate(finely, there, values[there]) for values in (np.array(run.q), centres))
         points = cover.positions(bench.robot, q) - places[:, None]
-        gaps = bench.shape(np.zeros(3), passage.wxyz).signed_distance(points) - cover.radius
-        bounds = gaps.min(axis=1)  # the spheres cover the meshes
-        for k in np.argsort(bounds):
+        bounds = (bench.shape(np.zeros(3), wxyz).signed_distance(points) - cover.radius).min(axis=1)
+        for k in np.argsort(bounds):  # the spheres cover the meshes
             if bounds[k] >= best:
                 break
-            best = min(best, float(model.obstacle_distance(q[[k]], bench.shape(places[k], passage.wxyz))[0][0]))
+            best = min(best, float(model.obstacle_distance(q[[k]], bench.shape(places[k], wxyz))[0][0]))
     return best
 
 
@@ -301,7 +271,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run the subcommand."""
     tasks, task = chosen_task(options)
-    out = options.out
     bench = Bench(new_engine(tasks), task.name, options.diameter, options.margin, boxes=options.boxes)
     arrays: dict[str, Any] = {"diameter": options.diameter}
     figures: list[dict[str, Any]] = []
@@ -309,16 +278,17 @@ def run(options: argparse.Namespace) -> int:
         found = simulated(bench, crossing)
         if room_at_coming(bench, found, crossing) < SETTINGS.coming_room:
             continue
-        i, places = len(figures), np.array(found.obstacle)
+        i, ticks = len(figures), range(len(found.q))
+        places = np.array([crossing.at(k) for k in ticks])
         figures.append(figures_of(bench, crossing, found, seconds))
-        arrays |= {f"q_{i}": found.q, f"t_{i}": found.t}
+        arrays |= {f"q_{i}": found.q, f"t_{i}": TICK * np.array(ticks)}
         arrays |= {f"obstacle_{i}": places[:, 0] if options.obstacles == 1 else places}
-        arrays[f"wxyz_{i}"] = [passage.wxyz for passage in crossing.passages]
+        arrays[f"wxyz_{i}"] = crossing.wxyz
         values = (f"{name} {as_text(value)}" for name, value in figures[i].items() if name != "ticks")
         print(i, ", ".join(values), *sorted(phase.value for phase in found.phases), flush=True)
         if len(figures) == options.runs:
             break
-    write_npz(out, **arrays)
+    write_npz(options.out, **arrays)
     shape = "box" if options.boxes else "sphere"
     size = f"{options.obstacles} {shape}(s) of {options.diameter:g} m"
     print(f"\n{task.name}, {size} at {options.speed:g} m/s, margin {options.margin:g} m")
@@ -335,7 +305,7 @@ def figures_of(bench: Bench, crossing: Crossing, run: Run, seconds: float) -> di
         "missed": 1e3 * float(np.linalg.norm(bench.robot.end_effector(q[-1]) - bench.goal)),
         "velocity": float((np.abs(velocity) / bench.robot.velocity_limits).max()),
         "acceleration": float(np.abs(np.diff(velocity, axis=0)).max() / TICK / ControllerSettings().acceleration),
-        "lost": run.t[-1] - crossing.begins - seconds,  # beside the motion without obstacles
+        "lost": TICK * (len(q) - 1) - crossing.begins - seconds,  # beside the motion without obstacles
         "ticks": np.array(run.ticks),
     }
 

@@ -42,12 +42,12 @@ import numpy as np
 
 from dt_viz.baselines.base import INSTALL, NotFittedError, Plan, Planner, Problem
 from dt_viz.baselines.registry import METHODS, problem_of
+from dt_viz.errors import FormatError
 from dt_viz.evaluate import figures
 from dt_viz.evaluate.around import TURN_ARC, in_ball
 from dt_viz.evaluate.held_out import frechet
 from dt_viz.evaluate.options import (
     FOLDER,
-    InputError,
     Row,
     new_engine,
     report,
@@ -176,7 +176,7 @@ def drawn(problem: Problem, count: int, num_perturbed: int, seed: int) -> list[R
     """Draw the places of a task, as the module says, and perturbed starts, divided among the places.
 
     Raises:
-        InputError: the places are not found.
+        FormatError: the places are not found.
     """
     task, model = problem.task, problem.robot.collision
     rng, mean, undisturbed = np.random.default_rng(seed), task.mean_path, problem.learned.demonstrated.paths
@@ -195,7 +195,7 @@ def drawn(problem: Problem, count: int, num_perturbed: int, seed: int) -> list[R
         beside = np.random.default_rng([seed, len(places)])  # places do not depend on how many starts there are
         places.append(RandomPlace(sphere, _perturbed(problem, sphere, share, beside)))
     found = f"{len(places)} of {task.title!r} among {SETTINGS.max_drawn} spheres"
-    raise InputError("--count", found, "places at which each motion collides and the ends are free, fewer of them")
+    raise FormatError("--count", found, "places at which each motion collides and the ends are free, fewer of them")
 
 
 def _perturbed(problem: Problem, sphere: Sphere, num: int, rng: np.random.Generator) -> Array:

@@ -26,8 +26,9 @@ import numpy as np
 from dt_viz.baselines.base import INSTALL, NotFittedError, Problem
 from dt_viz.baselines.registry import TRAINED, problem_of
 from dt_viz.baselines.weights import save_weights, weights_file
+from dt_viz.errors import FormatError
 from dt_viz.evaluate.held_out import folds_of, frechet
-from dt_viz.evaluate.options import FOLDER, InputError, add_lasa, report, whole_number
+from dt_viz.evaluate.options import FOLDER, add_lasa, report, whole_number
 from dt_viz.folders import default_cache_folder
 from dt_viz.learning.store import FitStore
 from dt_viz.motion.following import Follower
@@ -54,10 +55,10 @@ def run(options: argparse.Namespace) -> int:
     tasks, names = known_tasks(options.lasa), options.task or list(TASKS)
     for name in names:
         if name not in tasks:
-            raise InputError("--task", repr(name), ", ".join(tasks))
+            raise FormatError("--task", repr(name), ", ".join(tasks))
     alone = [name for name in names if len(tasks[name]().demonstrations) == 1]
     if options.folds and alone:
-        raise InputError("--folds", f"one demonstration only in {', '.join(alone)}", "two or more in each")
+        raise FormatError("--folds", f"one demonstration only in {', '.join(alone)}", "two or more in each")
     fits, follower = FitStore(default_cache_folder()), Follower(load_jaco())
     rows: list[dict[str, Any]] = []
     for name in names:

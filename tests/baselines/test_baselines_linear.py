@@ -82,7 +82,7 @@ class TestSurroundings:
     def test_a_line_is_free_only_where_no_vertex_of_the_meshes_enters_anything(self, problem, lines, shape):
         place = as_point(problem.task.mean_path[50])
         part = Sphere(place, 0.15) if shape == "sphere" else Box(place, (0.1, 0.2, 0.12))
-        around = PlanningScene.of(problem.robot, Union((part,)))
+        around = PlanningScene(problem.robot, Union((part,)))
         verdicts = []
         for line in lines[:30]:
             verdicts.append(around.is_free(*line))
@@ -92,7 +92,7 @@ class TestSurroundings:
 
     def test_what_is_far_from_everything_is_free(self, problem, lines):
         model = load_jaco().collision
-        far, nothing = (PlanningScene.of(problem.robot, Union(parts)) for parts in ((Sphere((5.0, 0.0, 0.0)),), ()))
+        far, nothing = (PlanningScene(problem.robot, Union(parts)) for parts in ((Sphere((5.0, 0.0, 0.0)),), ()))
         for line in lines[:15]:
             itself = model.nearest_to_itself(np.stack(line))
             assert far.is_free(*line) == nothing.is_free(*line)
@@ -100,7 +100,7 @@ class TestSurroundings:
                 assert nothing.is_free(*line)
 
     def test_nothing_between_two_samples_is_passed_through(self, problem, lines):
-        free = [line for line in lines if PlanningScene.of(problem.robot, Union()).is_free(*line)]
+        free = [line for line in lines if PlanningScene(problem.robot, Union()).is_free(*line)]
         assert len(free) > 10
         rng, mesh = np.random.default_rng(2), load_jaco().meshes[-1]
         for start, end in free[:15]:
@@ -108,10 +108,10 @@ class TestSurroundings:
             vertex = mesh.vertices[rng.integers(len(mesh.vertices))]
             place = poses.rotations[0, mesh.joint + 1] @ vertex + poses.origins[0, mesh.joint + 1]
             speck = Union((Sphere(as_point(place), 0.0005),))
-            assert not PlanningScene.of(problem.robot, speck).is_free(start, end)
+            assert not PlanningScene(problem.robot, speck).is_free(start, end)
 
     def test_the_arm_may_not_pass_through_itself_or_the_table(self, problem):
-        nothing, model, rng = PlanningScene.of(problem.robot, Union()), load_jaco().collision, np.random.default_rng(1)
+        nothing, model, rng = PlanningScene(problem.robot, Union()), load_jaco().collision, np.random.default_rng(1)
         seen = set()
         for q in problem.robot.clip(rng.uniform(-np.pi, np.pi, size=(40, 6)) + problem.robot.home):
             report = model.report(q[None], Union())

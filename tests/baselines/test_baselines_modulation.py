@@ -35,16 +35,16 @@ def test_on_the_surface_nothing_flows_into_the_obstacle_and_far_away_the_velocit
     y, rng = on_surface(obstacle), np.random.default_rng(1)
     v, normal = rng.normal(size=y.shape), obstacle.distance_and_normal(y)[1]
     assert len(y) > 100
-    inward, before = (-np.einsum("nd,nd->n", normal, u) for u in (modulated(obstacle, y, v)[0], v))
+    inward, before = (-np.einsum("nd,nd->n", normal, u) for u in (modulated(obstacle, y, v), v))
     assert inward.max() < 1e-6 and before.max() > 0.5
-    assert np.abs(modulated(obstacle, 1000 * y, v)[0] - v).max() < 1e-4 * np.abs(v).max()
+    assert np.abs(modulated(obstacle, 1000 * y, v) - v).max() < 1e-4 * np.abs(v).max()
 
 
 def test_where_it_leads_away_the_radial_velocity_stays_and_without_an_obstacle_all_of_it():
     y = on_surface(SPHERE)
     away = 0.1 * SPHERE.distance_and_normal(y)[1]
-    np.testing.assert_allclose(modulated(SPHERE, y, away)[0], away, rtol=1e-5)
-    assert modulated(Union(), y, away)[0] is away
+    np.testing.assert_allclose(modulated(SPHERE, y, away), away, rtol=1e-5)
+    assert modulated(Union(), y, away) is away
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +59,7 @@ def test_motions_are_those_of_the_modulated_velocity_reach_the_goal_and_stay_out
     (path,), (times,) = plan.paths, plan.times
     some = np.linspace(0, 0.6 * times[-1], 16)
     at = np.stack([np.interp(some, times, axis) for axis in path.T], axis=1)
-    oracle = stepped(lambda y: modulated(in_the_way, y, system.velocity(y))[0], start, some, 5)[0]
+    oracle = stepped(lambda y: modulated(in_the_way, y, system.velocity(y)), start, some, 5)[0]
     assert np.linalg.norm(at - oracle, axis=1).max() < 3e-3
     assert np.linalg.norm(at - system.rollout(start[0], some), axis=1).max() > 0.02  # it is not the imitation
     assert np.linalg.norm(path[-1] - problem.learned.goal) < 1e-6

@@ -15,7 +15,7 @@ from dt_viz.baselines import linear, mpnet, mpnet_rrt
 from dt_viz.baselines.base import NotFittedError
 from dt_viz.baselines.mpnet import (
     ARCHITECTURE,
-    MPNetModel,
+    Network,
     Search,
 )
 from dt_viz.baselines.mpnet_training import SETTINGS, initial, loss_and_gradient, steps, train
@@ -48,7 +48,7 @@ def search(free):
     """A search on a line: postures differ in their first joint only, and `free` decides of two of its values."""
 
     line = SimpleNamespace(robot=SimpleNamespace(clip=np.asarray), is_free=lambda start, end: free(start[0], end[0]))
-    model = MPNetModel.of(weights(), 6)
+    model = Network.of(weights())
     return Search(model, cast(PlanningScene, line), np.random.default_rng(0))
 
 
@@ -58,26 +58,18 @@ def at(*values):
 
 class TestModel:
     def test_dropout_leaves_out_the_asked_share_and_is_seeded(self):
-        model = MPNetModel.of(weights(), 6)
+        model = Network.of(weights())
         (first, again), other = (
             (model.next(np.zeros(6), np.ones(6), np.random.default_rng(0)) for _ in range(2)),
             (model.next(np.zeros(6), np.ones(6), np.random.default_rng(1))),
         )
         np.testing.assert_array_equal(first, again)
         assert np.abs(first - other).max() > 1e-3
-        masks = model.planning.masks(np.random.default_rng(0), 50)
+        masks = model.masks(np.random.default_rng(0), 50)
         for mask, width in zip(masks, ARCHITECTURE.hidden[:-1], strict=True):
             assert mask.shape == (50, width)
             assert set(np.unique(mask)) == {0, 1 / (1 - ARCHITECTURE.dropout)}
             assert np.mean(mask == 0) == pytest.approx(ARCHITECTURE.dropout, abs=0.06)
-
-    @pytest.mark.parametrize("name", ["W_2", "scale", "slopes"])
-    def test_weights_that_lack_something_are_refused_by_name(self, name):
-        arrays = weights()
-        with pytest.raises(NotFittedError, match=f"{name}.*nothing"):
-            MPNetModel.of({key: value for key, value in arrays.items() if key != name}, 6)
-        with pytest.raises(NotFittedError, match=f"{name}.*found"):
-            MPNetModel.of({**arrays, name: arrays[name][:-1]}, 6)
 
     @pytest.mark.parametrize("fit", [mpnet.fit, mpnet_rrt.fit])
     @pytest.mark.parametrize("arm", OTHER_ARMS)
@@ -205,7 +197,7 @@ class TestTraining:
 
     def test_what_training_returns_can_be_planned_with(self, problem):
         lines = []
-        model = MPNetModel.of(train(problem, 100, lines.append), 6)
+        model = Network.of(train(problem, 100, lines.append))
         assert len(lines) == 1
         q, goal = problem.postures[0][[0, -1]]
         rng = np.random.default_rng(0)

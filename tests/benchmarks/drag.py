@@ -94,11 +94,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run the command."""
     tasks, task = chosen_task(options)
-    out = options.out
     drags = [_measured(new_engine(tasks), task, places, options) for places in paths(task, options)]
     moved = [drag.moved for drag in drags]
     write_npz(
-        out,
+        options.out,
         **{name: np.concatenate([getattr(d, name) for d in drags]) for name in ("rollouts", "places", "blocked")},
         seconds=np.concatenate([d.seconds for d in drags]),
         drag=np.repeat(np.arange(len(drags)), [len(d.places) for d in drags]),

@@ -23,9 +23,9 @@ import numpy as np
 
 from dt_viz.avoidance.avoidance import SPACES, Avoidance
 from dt_viz.avoidance.bias import BiasPoint
+from dt_viz.errors import FormatError
 from dt_viz.evaluate.options import (
     TABLES,
-    InputError,
     add_task,
     avoiding,
     chosen_task,
@@ -169,7 +169,7 @@ def _scenario(task: Task, options: argparse.Namespace) -> Scenario:
     places = np.linspace(0, 100, options.obstacles + 2).round().astype(int)[1:-1]
     diameter = Sphere(task.obstacle_position).diameter / max(1, options.obstacles)
     if options.drag == "obstacle" and options.obstacles == 0:
-        raise InputError("--obstacles", "0", "1 or more, or --drag bias")
+        raise FormatError("--obstacles", "0", "1 or more, or --drag bias")
     shape = SHAPES[options.shape]
     obstacles = tuple(shape(as_point(place), diameter) for place in task.mean_path[places])
     scenario = avoiding(task, Avoidance(obstacles, space=options.space))
@@ -201,4 +201,4 @@ def _drag(
 def _settle(session: Session) -> None:
     """Wait until nothing is left to compute."""
     if not session.wait_idle(timeout := 120.0):
-        raise InputError("--task", f"frames that take more than {timeout:g} s", "a task that can be shown live")
+        raise FormatError("--task", f"frames that take more than {timeout:g} s", "a task that can be shown live")

@@ -18,7 +18,8 @@ from typing import Any
 from PIL import Image
 
 from dt_viz.control.controller import Phase
-from dt_viz.evaluate.options import InputError, add_lasa
+from dt_viz.errors import FormatError
+from dt_viz.evaluate.options import add_lasa
 from dt_viz.folders import default_cache_folder
 from dt_viz.learning.store import FitStore
 from dt_viz.robot.models import load_jaco
@@ -50,14 +51,14 @@ def run(options: argparse.Namespace) -> int:
     try:
         from playwright.sync_api import sync_playwright
     except ImportError:
-        raise InputError("playwright", "not installed", "pip install 'dt-viz[test]'") from None
+        raise FormatError("playwright", "not installed", "pip install 'dt-viz[test]'") from None
     if CHROMIUM is None:
-        raise InputError("Chromium", "not installed", "apt-get install chromium")
+        raise FormatError("Chromium", "not installed", "apt-get install chromium")
     tasks = known_tasks(options.lasa)
     scenes = (FIRST, *(scene.name for scene in offered(tasks)))
     lacking = [name for name in options.only or () if name not in scenes]
     if lacking:
-        raise InputError("--only", ", ".join(lacking), "scenes whose tasks there are; --lasa DIR adds more")
+        raise FormatError("--only", ", ".join(lacking), "scenes whose tasks there are; --lasa DIR adds more")
     width, height = options.size
     complaints: list[str] = []
     with sync_playwright() as playwright:

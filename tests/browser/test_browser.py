@@ -257,21 +257,6 @@ def test_the_saved_png_has_the_chosen_size_and_is_not_blank(visit):
         assert (np.abs(corner - shade).max(axis=1) < 4).any()
 
 
-def test_each_visitor_has_a_private_scene(browser, server, visit):
-    _, first = visit
-    page = browser.new_page(viewport={"width": 320, "height": 240})
-    try:
-        page.goto(f"http://127.0.0.1:{server.port}", timeout=1000 * PATIENCE)
-        wait_until(lambda: len(server.visitors) == 2, "the second visitor")
-        (second,) = set(server.visitors) - {first}
-        second.session.edit("test", **changing(second.session.scenario, avoids=False))
-        assert second.session.wait_idle(PATIENCE)
-        assert first.session.scenario.avoids
-    finally:
-        page.close()
-        wait_until(lambda: set(server.visitors) == {first}, "the second visitor to leave")
-
-
 def test_keys_do_what_the_panel_does(visit):
     page, visitor = visit
     session = visitor.session

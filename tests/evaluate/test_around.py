@@ -12,14 +12,14 @@ from dt_viz.evaluate.around import FIGURES, TURN_ARC, Place, _shares
 from dt_viz.metrics import distance_from_path, sharpest_turn
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.robot.models import load_jaco
-from dt_viz.scenario.tasks import lasa_tasks
+from dt_viz.scenario.tasks import known_tasks
 from dt_viz.warning import ARM, Kind, MotionWarning
 
 
 @pytest.fixture(scope="module")
 def middle(lasa):
     """The middle of the mean demonstration in the world, metres."""
-    return lasa_tasks(lasa)["Hook"]().mean_path[50]
+    return known_tasks(lasa)["Hook"]().mean_path[50]
 
 
 @pytest.fixture
@@ -119,7 +119,7 @@ def test_places_of_the_hand_are_measured_at_its_point_and_compared_with_what_is_
 def test_places_are_any_shapes_of_any_size_along_the_whole_motion(lasa, measured):
     shapes = "--shape any --number 2 --size 0.06,0.25 --no-avoidance"
     arrays = measured("around", f"--count 12 --along 0,1 --spread 0 {shapes}")[0]
-    mean = lasa_tasks(lasa)["Hook"]().mean_path
+    mean = known_tasks(lasa)["Hook"]().mean_path
     places, sizes = arrays["places"][1:], arrays["sizes"][1:]
     assert (places[:, 0] != places[:, 1]).any(axis=1).all()
     assert places.shape == sizes.shape == (12, 2, 3) and arrays["turns"].shape == (13, 2, 4)

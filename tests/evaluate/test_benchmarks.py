@@ -15,8 +15,8 @@ from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
 from dt_viz.learning.augmented import fit_augmented
 from dt_viz.learning.imitation import fit
 from dt_viz.learning.timing import TimedAttractor
-from dt_viz.metrics import discrete_frechet, distance_from_path
-from dt_viz.scenario.tasks import TASKS, lasa_tasks
+from dt_viz.metrics import discrete_frechet
+from dt_viz.scenario.tasks import TASKS, known_tasks
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Stage
 from tests.benchmarks import drag, exactness, latency, sitting
@@ -76,27 +76,6 @@ def test_a_drag_writes_every_step_and_counts_its_jumps(measured, monkeypatch):
     assert rows[-1]["frames"] == len(places) - 1 and rows[-1]["blocked"] == arrays["blocked"].sum()
 
 
-def test_a_frame_counts_where_any_of_its_rollouts_jumps():
-    rollouts = np.zeros((4, 2, 5, 3))
-    rollouts[1:, 0, :, 0] += 0.04  # less than a jump
-    rollouts[2:, 1, :, 0] += 0.06
-    one = drag.Drag(np.zeros((4, 3)), rollouts, np.array([False, True, True, False]), np.full(4, 0.002))
-    row = drag._row("all", [one, one], [one.moved, one.moved])
-    assert (row["frames"], row["frames in which a rollout jumps"], row["blocked"]) == (6, 2, 4)
-    assert row["largest step mm"] == pytest.approx(60) and row["median ms"] == pytest.approx(2.0)
-
-
-def test_random_drags_go_through_the_motion_and_repeat(lasa):
-    task, options = lasa_tasks(lasa)["Hook"](), argparse.Namespace(drags=6, seed=3, step=0.001)
-    first, second = (list(drag.paths(task, options)) for _ in range(2))
-    assert len(first) == 6
-    for places, same in zip(first, second, strict=True):
-        np.testing.assert_array_equal(places, same)
-        assert np.linalg.norm(np.diff(places, axis=0), axis=1).max() <= 0.001 + 1e-12
-        assert np.linalg.norm(places[0] - places[-1]) >= drag.REACH
-        assert distance_from_path(task.mean_path, places[[0, -1]]).min() < 5e-3 or len(places) < 160
-
-
 def test_a_scene_is_timed_until_each_stage(tmp_path):
     assert main(["scenes", "--only", "steps", "--out", str(tmp_path / "scenes.json")]) == 0
     ((times, median, worst),) = json.loads((tmp_path / "scenes.json").read_text())["tables"]
@@ -111,16 +90,6 @@ def test_a_scene_is_timed_until_each_stage(tmp_path):
 def exact(measured):
     """Runs a part of it on the hook: its rows."""
     return lambda part, options="": measured("exactness", f"--parts {part} {options}", "json")[0]
-
-
-def test_starts_are_spread_over_the_grown_box(lasa):
-    task = lasa_tasks(lasa)["Hook"]()
-    starts = exactness.random_starts(task, 600, 0)
-    box = np.concatenate(task.paths)
-    middle, size = (box.min(axis=0) + box.max(axis=0)) / 2, np.ptp(box, axis=0)
-    np.testing.assert_allclose(np.abs(starts - middle).max(axis=0), size, atol=0.02)  # twice as large
-    np.testing.assert_array_equal(starts, exactness.random_starts(task, 600, 0))
-    assert (starts != exactness.random_starts(task, 600, 1)).any()
 
 
 def test_all_starts_arrive_in_closed_form_and_stepped(exact):
@@ -177,7 +146,7 @@ def test_stepping_adaptively_is_as_accurate_as_asked_for():
 
 
 def test_velocity_is_timed_for_each_kind_of_stack(lasa, exact, monkeypatch):
-    every = exactness.stacks(lasa_tasks(lasa)["Hook"]())
+    every = exactness.stacks(known_tasks(lasa)["Hook"]())
     assert len(every) == len(set(every.values()))
     few = {name: every[name] for name in ("imitation", "bias point and sphere")}
     monkeypatch.setattr(exactness, "stacks", lambda _task: few)

@@ -58,8 +58,8 @@ class Sketches(NoFrames):
     def drive(self, frame):
         pass
 
-    def frames(self, scenario, *_how):
-        return (Sketch(scenario, stage) for stage in Stage)
+    def frames(self, *what):
+        return (Sketch(what[0], stage) for stage in Stage)
 
 
 class Display:

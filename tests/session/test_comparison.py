@@ -257,7 +257,7 @@ def test_methods_are_chosen_in_the_order_of_the_tables_and_their_arm_with_them()
 def test_what_is_not_installed_is_grey_with_the_command(server, monkeypatch):
     monkeypatch.setattr("dt_viz.baselines.base.find_spec", lambda _module: None)
     panel = ComparePanel(server.gui, Bindings())
-    assert not panel.folder.visible
+    assert not panel.table.visible
     boxes = {box.label: box for box in server.gui._gui_input_handle_from_uuid.values() if hasattr(box, "label")}
     assert boxes["MPNet-RRT"].disabled and not boxes["Modulation"].disabled
     assert 'pip install "dt-viz[baselines]"' in hint(METHODS["mpnet-rrt"])
