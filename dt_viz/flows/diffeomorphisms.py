@@ -224,7 +224,6 @@ class Placed(Diffeomorphism):
 
     @property
     def dim(self) -> int:
-        """Dimension d of the space that it is placed in."""
         return len(self.origin)
 
     def to_world(self, u: Array) -> Array:
@@ -236,7 +235,6 @@ class Placed(Diffeomorphism):
         return (y - self.origin) @ self.axes / self.scale
 
     def scaled(self, fraction: float) -> Placed:
-        """Frame and scale stay."""
         return replace(self, inner=self.inner.scaled(fraction))
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:

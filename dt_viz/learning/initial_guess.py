@@ -41,14 +41,11 @@ def unbending(motions: Array, num_stages: int, longest: float, max_stages: int) 
     goal, so that the groups stay side by side in the order in which they arrive.
 
     Args:
-        motions: (R, n, d) motions with a common goal, points of one index corresponding to each other; d is 2 or 3.
-            Their spread (RMS distance from the mean) is about 1.
-        num_stages: smallest number of maps that bend; one more before them spreads the rays.
+        motions: (R, n, d) with a common goal, points of one index corresponding to each other, and a spread of about 1.
+        num_stages: smallest number of maps that bend; one more before them spreads the rays, so that there are at least
+            two more shapes (R, n, d), in each of which every motion ends at the goal.
         longest: largest distance by which a map may move a point; it decides the number of maps.
         max_stages: largest number of maps.
-
-    Returns:
-        At least `num_stages` + 2 arrays (R, n, d). In each, every motion ends at the goal.
     """
     groups = groups_of(motions)
     members = [groups == group for group in range(groups.max() + 1)]
@@ -185,16 +182,10 @@ def _chain_rotations(increments: Array, kept: int, start: Rotation) -> Rotation:
 
 
 def regress(chain: FlowChain, shapes: Sequence[Array], regularisation: float, iterations: int = 5) -> list[Array]:
-    """Fit each layer, one after the other, to carry its shape to the next one.
+    """Fit each of L layers, one after the other, to carry its shape, of L + 1 (R, n, d), to the next one.
 
-    Args:
-        chain: L layers.
-        shapes: L + 1 arrays (R, n, d).
-        regularisation: weight of the squared RKHS norm against the mean squared distance.
-        iterations: number of fixed-point iterations for the path through the layer's Euler steps.
-
-    Returns:
-        The coefficients (m_l, d) of each layer.
+    The regularisation weighs the squared RKHS norm against the mean squared distance; fixed-point iterations find the
+    path through the layer's Euler steps. Returns the coefficients (m_l, d) of each layer.
     """
     h = 1.0 / chain.steps
     current = shapes[0].reshape(-1, chain.dim)

@@ -36,8 +36,7 @@ class PreparationSettings:
     max_moved_end: float = 0.3
     """Distance from the goal up to which an end is moved there; farther ones are left out."""
     max_turned_end: float = 0.6
-    """Angle, rad, from the goal's orientation up to which the hand at an end is turned there without a word, and counts
-    in the mean that this is."""
+    """Angle, rad, from the goal's orientation, a mean, up to which an end counts in it and is turned without a word."""
     at_goal: float = 0.05
     """Distance from the goal up to which a start is at the goal."""
     standing_step: float = 1e-3
@@ -63,8 +62,7 @@ class PreparationSettings:
     leave_out: bool = True
     """Whether takes that end elsewhere are left out; otherwise their ends are moved, however far."""
     outlier: float = 3.0
-    """Least length of the jumps to an outlier and back, relative to a long step (the 75 % quantile) of the take. The
-    longest step of clean takes is 2.2, at any rate."""
+    """Least length of jumps to an outlier and back, in long steps (75 % quantile) of the take; clean ones have 2.2."""
     smallest_outlier: float = 0.03
     """Least length of these jumps, relative to the take's size, twice the median distance from its middle."""
     jitter: float = 1.05

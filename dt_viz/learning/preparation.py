@@ -124,11 +124,9 @@ class Motions:
         return float(self.distances(system, states).max()) / self.extent
 
     def distances(self, system: DiffeomorphicSystem, states: Array) -> Array:
-        """Discrete Fréchet distances (R,) of a system's motions from these.
+        """Discrete Fréchet distances (R,) of the motions of a system from these, which begin in states (R, k).
 
-        Args:
-            system: of states, the first d coordinates of which are a place.
-            states: (R, k) in which its motions begin.
+        The first d coordinates of its states are a place.
         """
         wanted = self.resampled()
         z = system.base.at_fraction(system.transform.forward(states), np.linspace(1.0, 0.0, wanted.shape[1]))

@@ -42,11 +42,9 @@ class ChoiceSettings:
     folds: int = 5
     """Largest number of folds in which that is done."""
     iterations: int = 5
-    """Largest number of iterations of a plain fit to those of a fold: fewer than it gets when it is chosen, for what is
-    left out gains little by more."""
+    """Largest number of iterations of a plain fit to those of a fold; what is left out gains little by more."""
     alike: float = 1.05
-    """Distance of plain motions from what was left out, relative to that of augmented ones, up to which they are as
-    good."""
+    """Ratio of plain motions' distance from what was left out to augmented ones', up to which they are as good."""
     close: float = 0.005
     """The same distance, relative to the extent, up to which they are good however good augmented ones are."""
     hopeless: float = 1.25
@@ -119,14 +117,8 @@ def leaving_out(
 ) -> StateChoice:
     """Follow motions by what the others teach in both states, in a few folds or until the plain one is clearly worse.
 
-    Motions of all lengths are in each fold, in whichever order they come. Goal and size are those of all motions, in
-    both states and for the mean alike.
-
-    Args:
-        motions: at least two.
-        choice: settings of the choice.
-        augmented: settings of the augmented state.
-        progress: see `dt_viz.learning.imitation.fit`.
+    Motions of all lengths are in each fold, in whichever order they come; there must be two at least. Goal and size are
+    those of all motions, in both states and for the mean alike.
     """
     off, folds = np.empty((3, 0)), min(choice.folds, len(motions.numbers))
     by_length = np.argsort([arc_length(path)[-1] for path in motions.positions], kind="stable")

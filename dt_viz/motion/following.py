@@ -77,12 +77,9 @@ class Follower:
     """Lifts motions of the end effector to the joints."""
 
     def __init__(self, robot: Robot, memo: Memo | None = None, shared: Memo | None = None) -> None:
-        """Take an arm.
+        """Take an arm, and what keeps the joints along what a drag leaves unchanged.
 
-        Args:
-            robot: the arm.
-            memo: what keeps the joints along what a drag leaves unchanged.
-            shared: what keeps the reference postures of tasks, for other followers, too.
+        `shared` keeps the reference postures of tasks, for other followers, too.
         """
         self.robot = robot
         self.whole_arm = WholeArm(robot)
@@ -90,11 +87,7 @@ class Follower:
         self._shared = Memo() if shared is None else shared
 
     def undisturbed(self, nominal: Nominal) -> Lift:
-        """The joints along the motion without any behaviour.
-
-        Raises:
-            UnreachableError: the arm cannot get to where the motions start.
-        """
+        """The joints along the motion without any behaviour; raises as `reference`."""
         own = self._demonstrated(nominal.learned, nominal.posture)
         if nominal.shaping.all():
             return own
@@ -130,13 +123,10 @@ class Follower:
         return self._demonstrated(nominal.learned, nominal.posture).pins
 
     def behaving(self, nominal: Nominal, solution: Solution, *, exact: bool) -> Lift:
-        """The joints along the motion with the behaviours of the end effector.
+        """The joints along a solution: the motion with the behaviours of the end effector on the nominal one.
 
-        Args:
-            nominal: what it begins from.
-            solution: that motion.
-            exact: whether the end effector is on that motion between the samples, too; else it may be off by
-                millimetres where the stack stretches space.
+        If `exact`, the end effector is on that motion between the samples, too; else it may be off by millimetres where
+        the stack stretches space.
         """
         samples, drawn = np.linspace(0, 1, NUM_CONFIGURATIONS), []
         for path, fractions in zip(solution.bundle.paths, solution.bundle.split(solution.bundle.fraction), strict=True):
@@ -165,12 +155,9 @@ class Follower:
         return replace(lifted, exactly=exactly)
 
     def along(self, nominal: Nominal, path: Array, orientations: Array | None = None) -> TrackedPath:
-        """The joints along one path (T, 3) of the end effector, metres.
+        """The joints along one path (T, 3) of the end effector, metres, perhaps with orientations (T, 4), wxyz.
 
-        Args:
-            nominal: the motion whose posture the arm stays near to.
-            path: where the end effector goes.
-            orientations: (T, 4) of it there, wxyz; None wants none.
+        The arm stays near to the posture of the nominal motion.
         """
         return track(self.robot, path, self.reference(nominal), orientations=orientations)
 
@@ -265,11 +252,7 @@ class Follower:
                 yield None if best == 0 else _as_posture(known.references[best]), free[best]
 
     def reference_postures(self, learned: Learned) -> ReferencePostures:
-        """The reference postures for a task's motions; the first time it takes a second or so.
-
-        Raises:
-            UnreachableError: the arm cannot get to where the motions start.
-        """
+        """The reference postures for a task's motions, a second's work the first time; raises as `reference`."""
         usual, paths = self._demonstrated(learned).reference, learned.demonstrated.paths
         return self._shared(
             "reference_postures",
@@ -279,11 +262,7 @@ class Follower:
         )
 
     def out_of_reach(self, nominal: Nominal) -> Mask:
-        """(R,) added starts that the arm cannot get to.
-
-        Raises:
-            UnreachableError: the arm cannot get to where the task's motions start.
-        """
+        """(R,) added starts that the arm cannot get to; raises as `reference`."""
         return nominal.added & (self.undisturbed(nominal).tracked.error[:, 0] > MAX_TRACKING_ERROR)
 
     def warnings(self, joints: TrackedPath, place: int) -> tuple[MotionWarning, ...]:
