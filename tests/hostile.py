@@ -330,7 +330,7 @@ def read(kind: str, name: str, content: bytes) -> None:
     if kind == "motion":
         saving.read_motion(content, name)
         return
-    solid = shapes.read_mesh(content, name).solid if kind == "mesh" else shapes.read_cloud(content, name).cloud.solid
+    solid = shapes.read_mesh(content, name)[0] if kind == "mesh" else shapes.read_cloud(content, name)[0].solid
     assert solid.distances.depth > 0
     assert np.isfinite(solid.distances.values).all()
 

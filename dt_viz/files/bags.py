@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -24,30 +22,12 @@ Samples = list[tuple[int, tuple[float, ...]]]
 """Times, nanoseconds, and places, perhaps with orientations x, y, z, w."""
 
 
-def read_bag(file: BinaryIO, source: Path, options: ReadOptions) -> Iterator[Table]:
-    """Read the poses or joint angles of one topic of a bag.
+def read_bag(path: Path, options: ReadOptions) -> Iterator[Table]:
+    """Read the poses or joint angles of one topic of a bag, a file or a folder.
 
     Raises:
         FormatError: no topic has any, or several have and none is chosen; the message lists the topics.
     """
-    with _on_disk(file, source) as path:
-        yield from read_bag_at(path, source.stem, options)
-
-
-@contextmanager
-def _on_disk(file: BinaryIO, source: Path) -> Iterator[Path]:
-    """Path of a file for what cannot read from memory."""
-    if isinstance(name := getattr(file, "name", None), str):
-        yield Path(name)
-        return
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / f"bag{source.suffix.lower()}"
-        path.write_bytes(file.read())
-        yield path
-
-
-def read_bag_at(path: Path, name: str, options: ReadOptions) -> Iterator[Table]:
-    """Read a bag, a file or a folder; see `read_bag`."""
     reader = imported("rosbags.highlevel", "ros").AnyReader
     typesys = imported("rosbags.typesys", "ros")
     with reader([path], default_typestore=typesys.get_typestore(typesys.Stores.LATEST)) as bag:
@@ -58,13 +38,13 @@ def read_bag_at(path: Path, name: str, options: ReadOptions) -> Iterator[Table]:
         check_at_most("bag", sum(connection.msgcount for connection in chosen), LIMITS.numbers // 8, "messages")
         kind = _kind(chosen[0])
         if kind == JOINTS:
-            yield Table(name, _joint_columns(messages))
+            yield Table(path.stem, _joint_columns(messages))
             return
         samples = _samples(messages, frame, chosen[0].topic) if kind in TRANSFORMS else _poses(messages)
     times = np.array([time for time, _ in samples], dtype=np.int64)
     values = np.array([place for _, place in samples]).reshape(len(samples), -1)
     names = ("x", "y", "z", "qx", "qy", "qz", "qw")[: values.shape[1]]
-    yield Table(name, {"t": _seconds(times)} | {name: values[:, k] for k, name in enumerate(names)})
+    yield Table(path.stem, {"t": _seconds(times)} | {name: values[:, k] for k, name in enumerate(names)})
 
 
 def _kind(connection: Any) -> str:  # noqa: ANN401 - of rosbags

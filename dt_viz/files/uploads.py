@@ -8,19 +8,18 @@ import subprocess
 import tempfile
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from dt_viz.errors import Cancelled, FormatError, end_if, never
 from dt_viz.files import worker
 from dt_viz.files.processes import start_module
+from dt_viz.files.values import unpacked
 
-Read = tuple[list[np.ndarray], tuple[str, ...]]
-"""Arrays of a file, and notes about it for the page."""
+T = TypeVar("T")
 START = 60.0
 """Longest time until a process is ready for a file, seconds; a busy machine takes ten to import what it needs."""
 PATIENCE = 20.0
@@ -28,7 +27,7 @@ PATIENCE = 20.0
 
 
 class _Process:
-    """A process of `dt_viz.files.worker`, which may read one file."""
+    """A process of `dt_viz.files.worker`, which may read the files of one request."""
 
     def __init__(self) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="dt-viz-")  # what a process leaves that is ended goes with it
@@ -42,14 +41,12 @@ class _Process:
         """Whether it has ended by itself."""
         return self._process.poll() is not None
 
-    def read(self, request: Sequence[bytes], cancelled: Cancelled) -> Read:
-        """Have a file read, and end. Raises as `read_upload`."""
-        giving = threading.Thread(target=self._give, args=(request,), name="upload", daemon=True)
-        giving.start()
+    def read(self, kind: type[T], request: bytes, cancelled: Cancelled) -> T:
+        """Have files read, and end. Raises as `read_upload`."""
         try:
-            self._wait(cancelled)
+            self._give(request, cancelled)
             self._answer.seek(1)  # behind the line that says that it is ready
-            line = self._answer.readline(2**16)
+            line = self._answer.readline(2**22)
             if self._process.returncode or not line:
                 found = f"something that ended its reader ({self._process.returncode})"
                 raise FormatError("file", found, "a whole file")
@@ -57,27 +54,22 @@ class _Process:
             if "refused" in first:
                 field, found, accepted = map(str, first["refused"])
                 raise FormatError(field, found, accepted)
-            size, arrays = os.fstat(self._answer.fileno()).st_size, []
-            while self._answer.tell() < size:
-                arrays.append(np.load(self._answer, allow_pickle=False))
-            return arrays, tuple(map(str, first["notes"]))
+            arrays = {str(name): np.load(self._answer, allow_pickle=False) for name in first["arrays"]}
+            return unpacked(first["value"], kind, "file", arrays)
         finally:
             self.end()
-            giving.join()
 
-    def _give(self, request: Sequence[bytes]) -> None:
-        assert self._process.stdin is not None
-        with suppress(OSError), self._process.stdin as pipe:  # it may have ended
-            pipe.writelines(request)
-
-    def _wait(self, cancelled: Cancelled) -> None:
+    def _give(self, request: bytes, cancelled: Cancelled) -> None:
+        """Give it a request, and wait until it has ended."""
         deadline, ready = time.monotonic() + START, False
+        given: bytes | None = request
         while True:
             if not ready and os.fstat(self._answer.fileno()).st_size:
                 deadline, ready = time.monotonic() + PATIENCE, True
             with suppress(subprocess.TimeoutExpired):
-                self._process.wait(timeout=0.1)  # seconds until it may be unwanted
+                self._process.communicate(given, timeout=0.1)  # seconds until it may be unwanted
                 return
+            given = None  # the rest of it
             end_if(cancelled)
             if time.monotonic() > deadline:
                 found = f"data that take more than {PATIENCE:.0f} s to read"
@@ -130,32 +122,31 @@ _ready = _Ready()
 
 
 def read_upload(
-    kind: str,
-    suffix: str,
-    content: bytes,
+    kind: type[T],
+    files: Sequence[tuple[str, bytes]],
     cancelled: Cancelled = never,
-    options: Mapping[str, Any] = MappingProxyType({}),
-) -> Read:
-    """Read a file in another process.
+    **options: Any,  # noqa: ANN401 - what JSON can hold
+) -> T:
+    """Read files in another process.
 
     Args:
-        kind: "mesh", "points" or "takes".
-        suffix: the format, in lower case, such as ".stl".
-        content: all bytes of the file.
+        kind: class of what is read, one of `dt_viz.files.worker.READERS`.
+        files: name and content of each.
         cancelled: whether nobody wants it any more.
         options: further arguments of the reader.
 
     Returns:
-        Arrays of which nothing is known but that no object is in them: vertices and faces, or points and perhaps
-        labels; and notes for the page.
+        A value of that class, of its types; its arrays are finite, and of any shape.
 
     Raises:
-        FormatError: the file cannot be read, or not within the limits of memory and time.
+        FormatError: the files cannot be read, or not within the limits of memory and time.
         UnwantedError: nobody wants it any more.
         Exception: of almost any kind, if the process gave another answer.
     """
+    first = json.dumps([kind.__name__, [[name, len(content)] for name, content in files], options]).encode()
+    request = b"".join([first, b"\n", *(content for _, content in files)])
     try:
-        return _ready.take().read((json.dumps([kind, suffix, dict(options)]).encode(), b"\n", content), cancelled)
+        return _ready.take().read(kind, request, cancelled)
     finally:
         _ready.renew()
 

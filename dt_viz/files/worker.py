@@ -1,8 +1,9 @@
-"""Process that reads one visitor's file within limits of memory, time and files, and ends.
+"""Process that reads a visitor's files within limits of memory, time and files, and ends.
 
-It imports what it needs, gives an empty line, and waits for a file, or ends without one when its standard input is
-closed. It takes a line of JSON, the kind, the suffix and options, and then the file. It gives a line of JSON,
-`{"notes": …}` or `{"refused": [field, found, accepted]}`, and then arrays as `numpy.save` writes them.
+It imports what it needs, gives an empty line, and waits for files, or ends without them when its standard input is
+closed. It takes a line of JSON, what they are, the name and size of each, and options, and then the files. It gives a
+line of JSON, `{"value": …, "arrays": [names]}` as `dt_viz.files.values.packed` makes it, or `{"refused": [field, found,
+accepted]}`, and then the arrays as `numpy.save` writes them.
 """
 
 from __future__ import annotations
@@ -16,17 +17,18 @@ from typing import Any
 import numpy as np
 
 from dt_viz.errors import FormatError
-from dt_viz.files.recordings import answer_recordings
-from dt_viz.files.shapes import read_mesh, read_points
+from dt_viz.files.recordings import Recordings, read_recordings
+from dt_viz.files.shapes import Points, Triangles, read_points, read_triangles
+from dt_viz.files.values import packed
 
 MEMORY = 2**30
 """Largest address space of the process, bytes."""
-KINDS: Mapping[str, Callable[..., tuple[tuple[np.ndarray, ...], tuple[str, ...]]]] = {
-    "mesh": read_mesh,
-    "points": read_points,
-    "takes": answer_recordings,
+READERS: Mapping[str, Callable[..., Any]] = {
+    Triangles.__name__: read_triangles,
+    Points.__name__: read_points,
+    Recordings.__name__: read_recordings,
 }
-"""Readers by what is asked for: they give arrays, and notes about them for the page."""
+"""Readers of names and contents, by the class of what they give."""
 
 
 def limit() -> None:
@@ -48,30 +50,32 @@ def limit() -> None:
             resource.setrlimit(getattr(resource, name), (most, most))
 
 
-def answer(kind: str, suffix: str, content: bytes, **options: Any) -> tuple[dict[str, object], tuple[np.ndarray, ...]]:  # noqa: ANN401
-    """Read a file; return the first line of the answer and the arrays."""
+def answer(kind: str, files: list[tuple[str, bytes]], **options: Any) -> tuple[dict[str, Any], list[np.ndarray]]:  # noqa: ANN401
+    """Read files, each a name and its content; return the first line of the answer and the arrays."""
+    arrays: dict[str, np.ndarray] = {}
     try:
-        arrays, notes = KINDS[kind](content, suffix, **options)
+        value = packed(READERS[kind](files, **options), "file", arrays)
     except FormatError as error:
-        return {"refused": [error.field, error.found, error.accepted]}, ()
+        return {"refused": [error.field, error.found, error.accepted]}, []
     except MemoryError:
-        return {"refused": ["file", f"data that need more than {MEMORY / 1e9:.0f} GB to read", "a smaller file"]}, ()
+        return {"refused": ["file", f"data that need more than {MEMORY / 1e9:.0f} GB to read", "a smaller file"]}, []
     except Exception as error:  # no reader lists what corrupt bytes make it raise
         reason = " ".join(str(error).split())[:200] or type(error).__name__
-        return {"refused": ["file", f"something that cannot be read ({reason})", f"a {suffix} file"]}, ()
-    return {"notes": notes}, arrays
+        return {"refused": ["file", f"something that cannot be read ({reason})", "a whole file of its kind"]}, []
+    return {"value": value, "arrays": [*arrays]}, [*arrays.values()]
 
 
 def main() -> None:
-    """Read one file from the standard input."""
+    """Read one request from the standard input."""
     print(flush=True)
     line = sys.stdin.buffer.readline()
     if not line:
         return
     limit()
-    kind, suffix, options = json.loads(line)
+    kind, sizes, options = json.loads(line)
+    files = [(name, sys.stdin.buffer.read(size)) for name, size in sizes]
     with np.errstate(all="ignore"):
-        first, arrays = answer(kind, suffix, sys.stdin.buffer.read(), **options)
+        first, arrays = answer(kind, files, **options)
     sys.stdout.buffer.write(json.dumps(first).encode() + b"\n")
     for array in arrays:
         np.save(sys.stdout.buffer, array, allow_pickle=False)

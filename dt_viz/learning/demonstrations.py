@@ -4,21 +4,21 @@ They are saved as npz, seconds and metres, for i = 0, 1, 2, …: ``times_i`` (T,
 ``orientations_wxyz_i`` (T, 4) and ``name_i``, a string.
 """
 
-import io
 import logging
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from tempfile import TemporaryDirectory
+from typing import Any, Protocol
 
 import numpy as np
 
 from dt_viz.errors import DataError, FormatError, naming, parsing
 from dt_viz.files.checks import check_at_most, check_finite, real_numbers
-from dt_viz.files.folders import bag_folder, files_of, is_bag, is_lerobot, lerobot_folder
+from dt_viz.files.folders import accepted_as, files_of, parts_of, read_part
 from dt_viz.files.tables import ReadOptions, at_sample
-from dt_viz.files.takes import READERS, Take, in_si_units, read_takes
+from dt_viz.files.takes import READERS, Take, in_si_units
 from dt_viz.flows.rotations import turned
 
 logger = logging.getLogger(__name__)
@@ -240,7 +240,10 @@ def read_demonstrations(
     The suffix of the source, a name or path, says what it is; its stem names demonstrations that have no name.
     """
     wanted = ReadOptions(**options, joint_names=_joints(arm))
-    return demonstrations_of([_read(io.BytesIO(content), Path(source), wanted)], source, arm)
+    with TemporaryDirectory() as folder:
+        path = Path(folder, Path(source).name)
+        path.write_bytes(content)
+        return demonstrations_of([(Path(source), *_read(path, source, wanted)[1:])], source, arm)
 
 
 def _joints(arm: ForwardKinematics | None) -> tuple[str, ...]:
@@ -292,24 +295,16 @@ def demonstrations_of(
 def _found_in(path: Path, options: ReadOptions) -> list[Found]:
     """Read a file, or the files of a folder."""
     with parsing(DemonstrationError, path, "path", "a readable file or folder"):
-        if not path.is_dir():
-            if not path.is_file():
-                raise FormatError("path", "no such file or folder", "a readable file or folder")
-            with path.open("rb") as file:
-                return [_read(file, path, options)]
-        if is_bag(path):
-            return [(path, *bag_folder(path, options))]
-        if is_lerobot(path):
-            return [(path, *lerobot_folder(path, options))]
-        if not (files := files_of(path)):
+        if not path.exists():
+            raise FormatError("path", "no such file or folder", "a readable file or folder")
+        if not (parts := parts_of(path)):
             raise FormatError("folder", "no file of recorded motions", f"files of the kinds {', '.join(READERS)}")
-    return [read for file in files for read in _found_in(file, options)]
+    return [_read(part, part, options) for part in parts]
 
 
-def _read(file: BinaryIO, source: Path, options: ReadOptions) -> Found:
-    accepted = READERS.get(source.suffix.lower(), (None, "a file of recorded motions"))[1]
-    with parsing(DemonstrationError, source, "file", accepted):
-        return (source, *read_takes(file, source, options))
+def _read(path: Path, source: str | Path, options: ReadOptions) -> Found:
+    with parsing(DemonstrationError, source, "file", accepted_as(path)):
+        return (path, *read_part(path, options))
 
 
 def _in_frame_of(take: Take, arm: ForwardKinematics | None) -> Take:
@@ -325,7 +320,7 @@ def _hand(take: Take, arm: ForwardKinematics | None) -> np.ndarray:
     """Positions (T, d) of the hand, metres, perhaps by an arm's kinematics."""
     q, names = take.joints, take.joint_names
     if take.positions is not None or q is None:
-        return np.empty((0, 3)) if take.positions is None else take.positions
+        return take.values
     found = f"angles of {q.shape[1]} joints ({', '.join(names)[:160]})"
     if arm is None:
         accepted = "places of the hand, x, y and perhaps z; or name the arm that turns angles into such: arm=…"

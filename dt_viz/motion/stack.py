@@ -95,10 +95,6 @@ class Solution:
         """The warnings of the transforms."""
         return tuple(warning for applied in self.built for warning in applied.made.warnings)
 
-    def at(self, place: int) -> Applied | None:
-        """The layer at this place in the whole stack, as it was made; None where it is off."""
-        return next((applied for applied in self.built if applied.place == place), None)
-
     def positions_at(self, index: Indices, fraction: Array) -> Array:
         """End effector (N, 3), metres, of the rollouts `index` (N,) at the fractions `fraction` (N,) of their rays."""
         return self.transform.inverse(self.rays.at(index, fraction))[:, :3]

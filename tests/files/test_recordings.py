@@ -1,8 +1,8 @@
 """Visitors' recordings: several files at once, archives, what is asked, and what is refused, by the limited process."""
 
 import io
-import json
 import zipfile
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import pytest
 
 from dt_viz.errors import FormatError
 from dt_viz.files import recordings
-from dt_viz.files.recordings import NO_COLUMN, answer_recordings, recordings_of, request
+from dt_viz.files.recordings import NO_COLUMN, Recordings, read_recordings
 from dt_viz.files.uploads import read_upload
 
 TIMES = 0.02 * np.arange(60)
@@ -34,11 +34,8 @@ TIMED = table(HEADER, [TIMES, *path_of().T])
 
 def read(*files, answers=None, process=False):
     """What is read of files, each a name and its content."""
-    content, options = request(files, answers or {}, JOINT_NAMES)
-    if process:
-        return recordings_of(read_upload("takes", "recording", content, options=options)[0])
-    arrays, _ = answer_recordings(content, "recording", **json.loads(json.dumps(options)))
-    return recordings_of(arrays)
+    reader = partial(read_upload, Recordings) if process else read_recordings
+    return reader([*files], answers=answers or {}, joint_names=[*JOINT_NAMES])
 
 
 def zipped(files, compression=zipfile.ZIP_STORED):

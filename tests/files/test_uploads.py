@@ -14,6 +14,7 @@ from pages import PATIENCE, wait_until
 
 from dt_viz.errors import FormatError, UnwantedError
 from dt_viz.files import uploads, worker
+from dt_viz.files.shapes import Triangles
 from dt_viz.files.uploads import read_upload
 from dt_viz.obstacles.files import ShapeError, read_mesh
 
@@ -41,15 +42,15 @@ def reader(tmp_path, monkeypatch):
 
 
 def test_arrays_and_notes_come_back():
-    (vertices, faces), notes = read_upload("mesh", ".stl", BOX)
-    assert vertices.shape == (8, 3) and faces.shape == (12, 3) and notes == ()
+    read = read_upload(Triangles, [("a.stl", BOX)])
+    assert read.vertices.shape == (8, 3) and read.faces.shape == (12, 3) and read.notes == ()
 
 
 def test_what_is_refused_says_why_in_one_line():
     with pytest.raises(FormatError, match="faces: found none"):
-        read_upload("mesh", ".obj", b"v 0 0 0\n")
+        read_upload(Triangles, [("a.obj", b"v 0 0 0\n")])
     with pytest.raises(FormatError, match="something that cannot be read"):
-        read_upload("mesh", ".3mf", b"no archive")
+        read_upload(Triangles, [("a.3mf", b"no archive")])
 
 
 @LINUX
@@ -64,17 +65,18 @@ def test_what_is_refused_says_why_in_one_line():
     ],
 )
 def test_what_it_does_beyond_its_limits_ends_it_and_nothing_else(reader, hostile):
-    reader("import sys\nfrom dt_viz.files import worker\nworker.limit()\n" + hostile)
+    begin = "import sys\nfrom dt_viz.files import worker\nprint(flush=True)\nworker.limit()\n"
+    reader(begin + hostile, begins=False)
     with pytest.raises(ShapeError, match=r"ended its reader|cannot be read"):
         read_mesh(BOX, "a.stl")
 
 
-@pytest.mark.parametrize("answer", ["", "[]", "{}", "no JSON", '{"refused": 3}', '{"notes": []}'])
+@pytest.mark.parametrize("answer", ["", "[]", "{}", "no JSON", '{"refused": 3}', '{"value": {}, "arrays": []}'])
 def test_any_other_answer_is_one_line_for_the_page(reader, answer):
     reader(f"print({answer!r})")
     with pytest.raises(ShapeError) as info:
         read_mesh(BOX, "a.stl")
-    assert str(info.value).startswith("a.stl: file: found something that cannot be read")
+    assert str(info.value).startswith("a.stl: file: found ")
 
 
 def test_what_hangs_is_ended(reader, monkeypatch):
@@ -82,7 +84,7 @@ def test_what_hangs_is_ended(reader, monkeypatch):
     monkeypatch.setattr(uploads, "PATIENCE", 0.3)
     start = time.monotonic()
     with pytest.raises(FormatError, match="take more than"):
-        read_upload("mesh", ".stl", bytes(10**7))
+        read_upload(Triangles, [("a.stl", bytes(10**7))])
     assert time.monotonic() - start < PATIENCE
 
 
@@ -91,7 +93,7 @@ def test_what_never_begins_is_ended(reader, monkeypatch):
     monkeypatch.setattr(uploads, "START", 0.3)
     start = time.monotonic()
     with pytest.raises(FormatError, match="take more than"):
-        read_upload("mesh", ".stl", bytes(10**7))
+        read_upload(Triangles, [("a.stl", bytes(10**7))])
     assert time.monotonic() - start < uploads.PATIENCE
 
 
@@ -99,7 +101,7 @@ def test_what_never_begins_is_ended(reader, monkeypatch):
 def test_what_ends_without_an_answer_says_so(reader, begins):
     reader("", begins=begins)
     with pytest.raises(FormatError, match="ended its reader"):
-        read_upload("mesh", ".stl", BOX)
+        read_upload(Triangles, [("a.stl", BOX)])
 
 
 def test_it_ends_when_its_visitor_leaves(reader):
@@ -107,7 +109,7 @@ def test_it_ends_when_its_visitor_leaves(reader):
     left = threading.Event()
     threading.Timer(0.3, left.set).start()
     with pytest.raises(UnwantedError):
-        read_upload("mesh", ".stl", bytes(10**7), left.is_set)
+        read_upload(Triangles, [("a.stl", bytes(10**7))], left.is_set)
 
 
 @pytest.mark.parametrize("answer", ["np.array([{}])", "np.lib.format.MAGIC_PREFIX"])
@@ -115,7 +117,7 @@ def test_nothing_is_unpickled(reader, answer):
     reader(f"""
         import sys, json, numpy as np
         sys.stdin.buffer.read()
-        sys.stdout.buffer.write(b'{{"notes": []}}\\n')
+        sys.stdout.buffer.write(b'{{"value": {{}}, "arrays": ["a"]}}\\n')
         answer = {answer}
         if isinstance(answer, bytes):
             sys.stdout.buffer.write(answer + bytes([1, 0, 118, 0]) + str(
@@ -124,7 +126,7 @@ def test_nothing_is_unpickled(reader, answer):
             np.save(sys.stdout.buffer, answer, allow_pickle=True)
     """)
     with pytest.raises((ValueError, MemoryError)):
-        read_upload("mesh", ".stl", BOX)
+        read_upload(Triangles, [("a.stl", BOX)])
 
 
 def test_one_is_ready_while_somebody_may_send_a_file_and_none_is_left():
@@ -133,13 +135,13 @@ def test_one_is_ready_while_somebody_may_send_a_file_and_none_is_left():
     for user in users:
         uploads.keep_ready(user)
     assert uploads._ready._process is None  # before the first file
-    read_upload("mesh", ".stl", BOX)
+    read_upload(Triangles, [("a.stl", BOX)])
     ready = uploads._ready._process
     assert ready is not None
     uploads.let_go(users[0])
     ready._process.kill()  # as a machine does that is short of memory
     ready._process.wait()
-    read_upload("mesh", ".stl", BOX)
+    read_upload(Triangles, [("a.stl", BOX)])
     assert uploads._ready._process not in {None, ready}
     uploads.let_go(users[1])
     assert uploads._ready._process is None
@@ -157,14 +159,14 @@ def test_it_ends_by_itself_when_the_server_has_gone():
 
 
 def test_answers_are_refusals_or_arrays():
-    assert worker.answer("points", ".csv", b"x,y,z\n1,2,one\n")[0] == {
+    assert worker.answer("Points", [("a.csv", b"x,y,z\n1,2,one\n")])[0] == {
         "refused": [
             "file",
             "something that cannot be read (could not convert string 'one' to float64 at row 0, column 3.)",
-            "a .csv file",
+            "a whole file of its kind",
         ]
     }
     file = io.BytesIO()
-    np.savez(file, points=np.eye(3))
-    first, (points,) = worker.answer("points", ".npz", file.getvalue())
-    assert first == {"notes": ()} and points.dtype == np.float64
+    np.savez(file, points=np.eye(3, dtype=np.float32))
+    first, (points,) = worker.answer("Points", [("a.npz", file.getvalue())])
+    assert first["arrays"] == ["file.points"] and first["value"]["notes"] == [] and points.dtype == np.float64

@@ -20,8 +20,8 @@ from dt_viz.pictures.occupancy import occupancy_picture
 from dt_viz.pictures.sketchbook import Pictures
 from dt_viz.scenario.scenario import MAX_OBSTACLES, View
 from dt_viz.scenario.tasks import TASKS
+from dt_viz.ui.scene.draggables import Obstacles, shaded
 from dt_viz.ui.scene.markers import in_slice
-from dt_viz.ui.scene.obstacles import Obstacles, shaded
 from dt_viz.ui.scene.picture import Look
 from dt_viz.ui.scene.slice_layers import OccupancySlice
 from dt_viz.ui.tabs.world import SHAPES, add, add_obstacles, delete, duplicate, name_of, with_room

@@ -18,13 +18,12 @@ from dt_viz.scenario.slices import SlicePose
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.frame import Stage
 from dt_viz.ui.scene.colour_scale import NUM_SHADES, from_oklab, oklab, ramp
+from dt_viz.ui.scene.draggables import MovableSlice, Obstacles
 from dt_viz.ui.scene.export import as_png
 from dt_viz.ui.scene.legend import OCCUPANCY, legend_of
-from dt_viz.ui.scene.obstacles import Obstacles
 from dt_viz.ui.scene.palette import LIGHT, css
 from dt_viz.ui.scene.picture import Look
 from dt_viz.ui.scene.rollouts import Rollouts
-from dt_viz.ui.scene.slice import MovableSlice
 from dt_viz.ui.scene.slice_layers import (
     OPACITY,
     VOLUME,
@@ -36,7 +35,7 @@ from dt_viz.ui.scene.slice_layers import (
     scale_of,
 )
 from dt_viz.ui.scene.tubes import NUM_SIDES, RolloutTubes
-from dt_viz.ui.tabs.show import WHOLE_ARM_NOTE, SlicePanel
+from dt_viz.ui.tabs.show import WHOLE_ARM_NOTE, ShowTab
 
 SCENARIO = avoiding("draw_s", (Sphere((0.0, -0.5, 0.4)),))
 POSE = SlicePose((0.1, -0.4, 0.5), (0.6, 0.8, 0.0, 0.0))
@@ -252,7 +251,7 @@ def test_a_saved_picture_is_white_behind_or_transparent():
 @pytest.fixture
 def opened(server):
     bound = Bound(SCENARIO)
-    yield SlicePanel(server.gui, bound), bound
+    yield ShowTab(server.gui, bound), bound
     server.gui.reset()
 
 

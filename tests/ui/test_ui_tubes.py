@@ -15,7 +15,7 @@ from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui.scene.palette import LIGHT
 from dt_viz.ui.scene.picture import Look
 from dt_viz.ui.scene.rollouts import Demonstrations, Ghost
-from dt_viz.ui.scene.style import TubeStyle
+from dt_viz.ui.scene.style import Style
 from dt_viz.ui.scene.tubes import INSIDE, NUM_RINGS, NUM_SIDES, RolloutTubes, Tubes, evenly_bent, tube_faces, tubes
 
 RADIUS, BALL = 0.003, 0.007
@@ -70,7 +70,7 @@ def test_points_are_denser_where_a_path_bends():
 
 
 def test_faces_are_sent_only_when_the_number_of_paths_changes(scene):
-    shown = Tubes(scene, "/tubes", TubeStyle("rollout", RADIUS))
+    shown = Tubes(scene, "/tubes", Style("rollout", radius=RADIUS))
     shown.show(PATHS, LIGHT)
     faces = shown.node.faces
     shown.show(PATHS + 0.1, LIGHT)

@@ -18,17 +18,14 @@ from dt_viz.session.frame import Frame
 from dt_viz.session.opening import Preview
 from dt_viz.session.session import Session
 from dt_viz.ui.scene.arm import ArmSequence
-from dt_viz.ui.scene.bias_points import BiasPoints
 from dt_viz.ui.scene.comparison import ComparedMotions
-from dt_viz.ui.scene.obstacles import Obstacles
+from dt_viz.ui.scene.draggables import BiasPoints, MovableSlice, Obstacles, Starts
 from dt_viz.ui.scene.palette import LIGHT, Theme
 from dt_viz.ui.scene.panels import Panels
 from dt_viz.ui.scene.picture import Look, Picture, add_ball, add_label
 from dt_viz.ui.scene.rollouts import Demonstrations, Ghost, LevelRollouts, Rollouts
-from dt_viz.ui.scene.slice import MovableSlice
 from dt_viz.ui.scene.slice_layers import ColourSlice, FieldArrows, Generator, OccupancySlice, Streamlines, WarpedGrid
 from dt_viz.ui.scene.stage import Stage
-from dt_viz.ui.scene.starts import Starts
 from dt_viz.ui.scene.style import STYLES
 from dt_viz.ui.scene.takes import Takes
 from dt_viz.ui.scene.tubes import RolloutTubes
