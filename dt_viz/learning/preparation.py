@@ -27,8 +27,7 @@ class ImitationError(ValueError):
 class NoCommonGoalError(ImitationError):
     """Demonstrations that end at several places, none of them the place of most.
 
-    Attributes:
-        goals: for each place, what ends there and where, and the place (d,), metres; those of most takes first.
+    Its `goals` are, those of most takes first, what ends at each place and where, and the place (d,), metres.
     """
 
     def __init__(self, message: str, goals: Sequence[tuple[str, tuple[float, ...]]]) -> None:

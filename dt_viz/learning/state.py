@@ -63,17 +63,11 @@ def learn(
     augmented: AugmentedSettings | None = None,
     choice: ChoiceSettings | None = None,
 ) -> AnyImitation:
-    """Learn a stable motion in the state that is asked for.
+    """Learn a stable motion in the state that is asked for, from demonstrations that end at (about) the same place.
 
-    Args:
-        demonstrations: at least one, all ending at (about) the same place.
-        settings: of the plain fit; None takes the defaults.
-        state: see the module.
-        labels: a number for each demonstration, which makes the state augmented; see `fit_augmented`.
-        progress: see `dt_viz.learning.imitation.fit`.
-        plain: gives the plain fit with these settings; None fits it here.
-        augmented: settings of the augmented state; None takes the defaults, with the preparation of the plain fit.
-        choice: settings of the choice; None takes the defaults.
+    Labels, a number for each demonstration, make the state augmented; see `fit_augmented`. None takes default settings,
+    for the augmented state with the preparation of the plain fit. `plain` gives the plain fit with some settings; None
+    fits it here, telling the progress, see `dt_viz.learning.imitation.fit`.
 
     Raises:
         ImitationError: nothing can be learned, there is no such state, or the plain state is to have labels.

@@ -140,8 +140,7 @@ class TrajectoryFit:
 class _DampedSystem:
     """(JᵀJ + D)·step = gradient with a diagonal D of two values, solved in the smaller of the two spaces.
 
-    With more unknowns than residuals, which is the rule in space, by Woodbury's identity:
-    step = D⁻¹(g − Jᵀ(I + J·D⁻¹·Jᵀ)⁻¹·J·D⁻¹·g).
+    With more unknowns than residuals by Woodbury's identity: step = D⁻¹(g − Jᵀ(I + J·D⁻¹·Jᵀ)⁻¹·J·D⁻¹·g).
     """
 
     def __init__(self, jacobian: Array, num_first: int) -> None:

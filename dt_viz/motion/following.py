@@ -166,12 +166,8 @@ class Follower:
     ) -> Admission:
         """Whether the whole arm can move around what it avoids, from which starts, and with which reference posture.
 
-        Args:
-            nominal: all rollouts.
-            avoidance: what is to be avoided.
-            posture: that where the obstacle was just before, which is kept while none leaves more starts free; None is
-                the usual one.
-            keeps: whether it is kept while it leaves the goal and any start free.
+        The `posture` that it had where the obstacle was just before, None for the usual one, is kept while no other
+        leaves more starts free, or, if it `keeps` it, while that leaves the goal and any start free.
         """
         asked = avoidance.avoided, avoidance.margin, posture, keeps
         return self._memo("admission", (nominal, asked), lambda: self._admission(nominal, *asked), newest=2)
@@ -346,10 +342,10 @@ def arm_samples(num: int) -> Indices:
 
 
 def room_at_rest(robot: Robot, task: Task, obstacle: Union, places: Array) -> Array:
-    """Distance (N,), metres, of the arm from the obstacle where the hand rests at `places` (N, 3).
+    """Distance (N,), metres, of the arm from the obstacle while the hand rests at `places` (N, 3).
 
     Raises:
-        UnreachableError: the arm cannot get to the task's starts, near whose posture it stays.
+        UnreachableError: the arm cannot get to the task's starts.
     """
     reference = inverse_kinematics(robot, task.starts.mean(axis=0))
     start = np.broadcast_to(reference, (len(places), robot.num_joints))

@@ -55,15 +55,11 @@ class Solved:
 
 
 def solve(scenario: Scenario, nominal: Nominal, precision: Precision, follower: Follower | None = None) -> Solved:
-    """The motion of a scenario, every flow run for its full duration.
+    """The motion of a scenario, every flow run for its full duration; see `warped`.
 
-    Args:
-        scenario: whose stack it is; its `warp` is left to `warped`. Sides on which the motions of its `passing` pass
-            obstacles are kept while these are dragged.
-        nominal: the undisturbed motion, from starts that the arm can begin at. Where the arm finds no way, that of the
-            result has another reference posture, or lacks the starts that have none.
-        precision: how exactly.
-        follower: the arm; None solves for the end effector alone.
+    Sides on which the motions of its `passing` pass obstacles are kept while these are dragged. The nominal motion is
+    from starts that the arm can begin at; where the arm finds no way, that of the result has another reference posture,
+    or lacks the starts that have none. Without a follower it is that of the end effector alone.
 
     Raises:
         UnreachableError: the whole arm is to avoid, and cannot get to where the motions start.
