@@ -6,8 +6,8 @@ A path is a polyline, an array ``(T, d)`` of points in any unit of length; dista
 from collections.abc import Callable
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
-from dt_viz.kernels.alignment import aligned
 from dt_viz.numerics import divisor
 
 
@@ -41,21 +41,60 @@ def discrete_frechet(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return the discrete Fréchet distances (*B,) between the points of paths (*B, n, d) and (*B, m, d), exactly.
 
     The least, over all ways of stepping forward along both from their first to their last points, of the largest
-    distance met (Eiter and Mannila, 1994). Leading axes are broadcast; that of a single pair is a 0-d value.
+    distance met: F(i, j) = max(‖a_i − b_j‖, min(F(i−1, j), F(i, j−1), F(i−1, j−1))) (Eiter and Mannila, 1994). A cell
+    of the anti-diagonal i + j = k depends only on the two anti-diagonals before it, so each of them is computed at
+    once, and for all pairs of a batch together. Leading axes are broadcast; that of a single pair is a 0-d value.
     """
+    if a.shape[-2] > b.shape[-2]:
+        a, b = b, a  # the sweep is as wide as the first is long
+    n, m = a.shape[-2], b.shape[-2]
     batch = np.broadcast_shapes(a.shape[:-2], b.shape[:-2])
-    flat = (np.broadcast_to(x, (*batch, *x.shape[-2:])).reshape(-1, *x.shape[-2:]) for x in (a, b))
-    first, second = map(np.ascontiguousarray, flat)
-    return aligned(first, second, False).reshape(batch)
+    a, b = np.broadcast_to(a, (*batch, *a.shape[-2:])), np.broadcast_to(b, (*batch, *b.shape[-2:]))
+    # Slid along b, the reversed a meets on its k-th place the pairs with i + j = k; beyond the ends of b is infinity.
+    reversed_a = np.moveaxis(a[..., ::-1, :], -1, 0).copy()  # (d, *B, n): column c is i = n − 1 − c
+    margins = [(0, 0)] * (b.ndim - 1) + [(n - 1, n - 1)]
+    padded_b = np.pad(np.moveaxis(b, -1, 0), margins, constant_values=np.inf)
+    places = np.moveaxis(sliding_window_view(padded_b, n, axis=-1), -2, 1)  # (d, n + m − 1, *B, n)
+
+    num = 32  # diagonals computed together: few enough to stay in the processor's cache
+    last, before = np.full((2, *batch, n + 1), np.inf)  # F² on the last two anti-diagonals; column n is i = −1
+    before[..., n] = 0.0  # from where F(0, 0) is reached; infinity ever after
+    for k in range(0, n + m - 1, num):
+        low, high = max(0, n - k - num), n - max(0, k - m + 1)  # the columns that lie in the table
+        squared = np.zeros(())
+        for place, point in zip(places[:, k : k + num, ..., low:high], reversed_a[..., low:high], strict=True):
+            squared = squared + np.square(place - point)
+        for distances in squared:
+            reached = np.minimum(last[..., low:high], last[..., low + 1 : high + 1])
+            np.minimum(reached, before[..., low + 1 : high + 1], out=reached)
+            np.maximum(reached, distances, out=before[..., low:high])
+            before[..., n] = np.inf
+            last, before = before, last
+    return np.sqrt(last[..., 0])
+
+
+def _skewed(table: np.ndarray, fill: float) -> np.ndarray:
+    """Return a table (n, m) by its anti-diagonals, (n + m − 1, n): row k, column i is the entry (i, k − i)."""
+    n, m = table.shape
+    padded = np.full((n, n + m), fill)
+    padded[:, :m] = table
+    return np.ascontiguousarray(padded.ravel()[: n * (n + m - 1)].reshape(n, n + m - 1).T)
 
 
 def dynamic_time_warping(a: np.ndarray, b: np.ndarray) -> float:
     """Return the least sum of distances between matched points of two paths, (n, d) and (m, d).
 
     Matched are pairs on a way that steps forward along one path, the other, or both, from their first to their last
-    points (Sakoe and Chiba, 1978). The sum grows with the number of points.
+    points: D(i, j) = ‖a_i − b_j‖ + min(D(i−1, j), D(i, j−1), D(i−1, j−1)) (Sakoe and Chiba, 1978). The sum grows with
+    the number of points.
     """
-    return float(aligned(np.ascontiguousarray(a)[None], np.ascontiguousarray(b)[None], True)[0])
+    distances = _skewed(np.linalg.norm(a[:, None] - b[None], axis=-1), np.inf)
+    before, last = np.full((2, len(a) + 1), np.inf)  # of the last two anti-diagonals; place i + 1 is row i
+    before[0] = 0.0
+    for distance in distances:
+        least = np.minimum(np.minimum(last[1:], last[:-1]), before[:-1])
+        before, last = last, np.concatenate([[np.inf], distance + least])
+    return float(last[-1])
 
 
 def rms_jerk(times: np.ndarray, points: np.ndarray, interval: float) -> float:

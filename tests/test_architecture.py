@@ -13,17 +13,16 @@ import dt_viz
 
 PACKAGE = Path(dt_viz.__file__).parent
 SOURCES = sorted(PACKAGE.rglob("*.py"))
-FOUNDATION = {"errors", "folders", "memo", "numerics", "shipped", "warning"}
+FOUNDATION = {"errors", "folders", "memo", "metrics", "numerics", "shipped", "warning"}
 """Modules of no package, which import each other only."""
-BELOW_SCENARIO = {"foundation", "metrics", "flows", "files", "learning", "obstacles", "robot", "avoidance"}
+BELOW_SCENARIO = {"foundation", "flows", "files", "learning", "obstacles", "robot", "avoidance"}
 BELOW_SESSION = BELOW_SCENARIO | {"scenario", "motion", "control", "pictures"}
 MAY_IMPORT: Mapping[str, set[str]] = {
     "foundation": set(),
     "kernels": {"foundation"},
-    "metrics": {"foundation", "kernels"},
     "flows": {"foundation", "kernels"},
     "files": {"foundation"},
-    "learning": {"foundation", "metrics", "flows", "files"},
+    "learning": {"foundation", "flows", "files"},
     "obstacles": {"foundation", "kernels", "flows", "files"},
     "robot": {"foundation", "kernels", "flows", "files", "obstacles"},
     "avoidance": {"foundation", "kernels", "flows", "learning", "obstacles", "robot"},
