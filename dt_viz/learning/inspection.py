@@ -299,10 +299,9 @@ class _Grid:
         times, x = take.times, take.positions
         spacing = max(float(np.median(np.diff(times))), times[-1] / 2000)
         self.nodes = np.linspace(0.0, times[-1], int(np.rint(times[-1] / spacing)) + 1)
-        for k in straight:
-            between = self.nodes[self.within(take.times[k : k + 2])]
-            x = np.concatenate([x, interpolate(between, times, take.positions)])
-            times = np.concatenate([times, between])
+        between = [self.nodes[self.within(times[k : k + 2])] for k in straight]
+        x = np.concatenate([x, *(interpolate(at, times, x) for at in between)])
+        times = np.concatenate([times, *between])
         self._times, self._x, self._mean = times, x, x.mean(axis=0)
         at = np.rint(times / times.max() * (len(self.nodes) - 1)).astype(int)
         self._counts = np.bincount(at, minlength=len(self.nodes)).astype(float)
