@@ -115,7 +115,9 @@ def read_motion(content: bytes, source: str | Path) -> tuple[SavedMotion, AnyImi
         version = plain.pop("version", None) if isinstance(plain, dict) else None
         if version != FORMAT:
             raise FormatError("version", repr(version)[:40], f"{FORMAT}; another version of DT-Viz may have saved it")
-        arrays = {name: _written(array, name) for name, array in arrays.items()}
+        for name, array in arrays.items():  # smaller numbers would grow eightfold when they are used
+            if array.dtype not in (np.float64, np.int64) and array.dtype.kind != "U":
+                raise FormatError(f"array {name[:40]!r}", f"values of type {array.dtype}", "float64, int64 or text")
         classes = {Transform: registry.KINDS, Obstacle: SHAPES}
         motion: SavedMotion = unpacked(plain, SavedMotion, "motion", arrays, classes)
         learned = {name.removeprefix(LEARNED): array for name, array in arrays.items() if name.startswith(LEARNED)}
@@ -148,10 +150,3 @@ def _from_before(plain: dict[str, Any]) -> dict[str, Any]:
         raise FormatError("space", repr(space)[:40], " or ".join(SPACES))
     held = {name: plain[name] for name in plain if space == "task" or name != "plane"}
     return held | {CLASS: Avoidance.kinds[space].__name__}
-
-
-def _written(array: np.ndarray, name: str) -> np.ndarray:
-    """Return an array of the numbers that are written; smaller ones would grow eightfold when they are used."""
-    if array.dtype not in (np.float64, np.int64) and array.dtype.kind != "U":
-        raise FormatError(f"array {name[:40]!r}", f"values of type {array.dtype}", "float64, int64 or text")
-    return array

@@ -147,7 +147,7 @@ class NoFrames:
     def task(self, name):
         return self.own[name][0] if name in self.own else TASKS[name]()
 
-    def frames(self, *_what):
+    def frames(self, *_what: Any) -> Any:
         return iter(())
 
 

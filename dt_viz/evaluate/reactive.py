@@ -104,9 +104,7 @@ class Run:
     """What happened."""
 
     q: list[Array] = field(default_factory=list)
-    t: list[float] = field(default_factory=list)
-    obstacle: list[Array] = field(default_factory=list)
-    """(P, 3) centres of the obstacles, metres."""
+    """(n,) joint angles at each tick, rad."""
     ticks: list[float] = field(default_factory=list)
     """Processor times of the ticks, seconds."""
     phases: set[Phase] = field(default_factory=set)
@@ -219,8 +217,6 @@ def simulated(bench: Bench, crossing: Crossing) -> Run:
     for k in range(len(crossing.places) + int((crossing.begins + SETTINGS.longest) / TICK)):
         t = k * TICK
         run.q.append(q)
-        run.t.append(t)
-        run.obstacle.append(crossing.at(k))
         if k >= len(crossing.places) and went and not present and controller.phase is Phase.RESTING:
             break
         if not went and t >= crossing.begins:
@@ -239,16 +235,15 @@ def simulated(bench: Bench, crossing: Crossing) -> Run:
 
 def room_at_coming(bench: Bench, run: Run, crossing: Crossing) -> float:
     """Smallest distance of the arm from an obstacle at the tick at which that comes, metres."""
-    body, centres = bench.follower.whole_arm, np.array(run.obstacle)
-    ticks = np.isfinite(centres[:, :, 0]).argmax(axis=0)
-    coming = [(run.q[k][None], bench.shape(centres[k, n], crossing.wxyz[n])) for n, k in enumerate(ticks)]
-    return min(float(body.clearance(q, obstacle)[0]) for q, obstacle in coming)
+    ticks = np.isfinite(crossing.places[:, :, 0]).argmax(axis=0)
+    coming = [(run.q[k][None], bench.shape(crossing.places[k, n], crossing.wxyz[n])) for n, k in enumerate(ticks)]
+    return min(float(bench.follower.whole_arm.clearance(q, obstacle)[0]) for q, obstacle in coming)
 
 
 def smallest_distance(bench: Bench, run: Run, crossing: Crossing) -> float:
     """Smallest distance of the arm's meshes from the obstacles, at the ticks and at five places between two, metres."""
     cover, model, best = bench.robot.body, bench.robot.collision, np.inf
-    for wxyz, centres in zip(crossing.wxyz, np.array(run.obstacle).transpose(1, 0, 2), strict=True):
+    for wxyz, centres in zip(crossing.wxyz, crossing.places.transpose(1, 0, 2), strict=True):
         (there,) = np.nonzero(np.isfinite(centres[:, 0]))
         finely = np.linspace(there[0], there[-1], 6 * (len(there) - 1) + 1)
         q, places = (interpolate(finely, there, values[there]) for values in (np.array(run.q), centres))
@@ -283,9 +278,10 @@ def run(options: argparse.Namespace) -> int:
         found = simulated(bench, crossing)
         if room_at_coming(bench, found, crossing) < SETTINGS.coming_room:
             continue
-        i, places = len(figures), np.array(found.obstacle)
+        i, ticks = len(figures), range(len(found.q))
+        places = np.array([crossing.at(k) for k in ticks])
         figures.append(figures_of(bench, crossing, found, seconds))
-        arrays |= {f"q_{i}": found.q, f"t_{i}": found.t}
+        arrays |= {f"q_{i}": found.q, f"t_{i}": TICK * np.array(ticks)}
         arrays |= {f"obstacle_{i}": places[:, 0] if options.obstacles == 1 else places}
         arrays[f"wxyz_{i}"] = crossing.wxyz
         values = (f"{name} {as_text(value)}" for name, value in figures[i].items() if name != "ticks")
@@ -309,7 +305,7 @@ def figures_of(bench: Bench, crossing: Crossing, run: Run, seconds: float) -> di
         "missed": 1e3 * float(np.linalg.norm(bench.robot.end_effector(q[-1]) - bench.goal)),
         "velocity": float((np.abs(velocity) / bench.robot.velocity_limits).max()),
         "acceleration": float(np.abs(np.diff(velocity, axis=0)).max() / TICK / ControllerSettings().acceleration),
-        "lost": run.t[-1] - crossing.begins - seconds,  # beside the motion without obstacles
+        "lost": TICK * (len(q) - 1) - crossing.begins - seconds,  # beside the motion without obstacles
         "ticks": np.array(run.ticks),
     }
 

@@ -82,10 +82,7 @@ def read_triangles(files: Files) -> Triangles:
         FormatError: it has no triangles, or too many.
         Exception: of any kind, on hostile bytes.
     """
-    ((name, content),) = files
-    suffix = Path(name).suffix.lower()
-    _check_text(content, suffix)
-    _check_model(content, suffix)
+    content, suffix = _opened(files)
     vertices, faces = _triangles(content, suffix)
     if not len(faces):
         accepted = f"a complete {suffix} file of a closed mesh; a point cloud is loaded as a cloud"
@@ -101,9 +98,7 @@ def read_points(files: Files) -> Points:
         FormatError: it has no points, or too many.
         Exception: of any kind, on hostile bytes.
     """
-    ((name, content),) = files
-    suffix = Path(name).suffix.lower()
-    _check_text(content, suffix)
+    content, suffix = _opened(files)
     points, labels, notes = {".npz": _npz_points, ".csv": _csv_points, ".ply": _ply_points}[suffix](content)
     check_at_most("points", len(points), LIMITS.points)
     points = real_numbers(points, "points", "biuf")
@@ -111,22 +106,24 @@ def read_points(files: Files) -> Points:
     return Points(points, None if labels is None else real_numbers(labels, "labels", "biuf"), notes)
 
 
-def _check_text(content: bytes, suffix: str) -> None:
+def _opened(files: Files) -> tuple[bytes, str]:
+    """Return the content and the suffix of a file. Raises FormatError if it would need too much, or an extension."""
+    ((name, content),) = files
+    suffix = Path(name).suffix.lower()
     if suffix in TEXTS and content.count(b"\n") > LIMITS.lines:
         raise too_many("file", LIMITS.lines, "lines")
-
-
-def _check_model(content: bytes, suffix: str) -> None:
-    """Raise FormatError if a file would unpack to very much, or needs an extension."""
     if suffix == ".3mf":
         arrays_of(content, max_bytes=LIMITS.model, names=())
     if suffix == ".gltf":
         json.loads(content)  # trimesh would look for another file
     if suffix in (".glb", ".gltf"):
         _, found, required = content.partition(b'"extensionsRequired"')
-        for name in EXTENSIONS:
-            if found and name in required:
-                raise FormatError("JSON", f"the extension {name.decode()}", "plain triangles (no Draco, no meshopt)")
+        for extension in EXTENSIONS:
+            if found and extension in required:
+                raise FormatError(
+                    "JSON", f"the extension {extension.decode()}", "plain triangles (no Draco, no meshopt)"
+                )
+    return content, suffix
 
 
 class _OtherFiles:
@@ -159,9 +156,8 @@ def _triangles(content: bytes, suffix: str) -> tuple[Array, Indices]:
             parts.append((part, place))
     vertices, faces, first = [np.empty((0, 3))], [np.empty((0, 3), dtype=np.int64)], 0
     for part, place in parts:
-        vertices.append(part.vertices @ place[:3, :3].T + place[:3, 3])
-        mirrored = np.linalg.det(place[:3, :3]) < 0
-        faces.append(first + (part.faces[:, ::-1] if mirrored else part.faces))
+        vertices.append(trimesh.transform_points(part.vertices, place))
+        faces.append(first + (part.faces[:, ::-1] if np.linalg.det(place[:3, :3]) < 0 else part.faces))
         first += len(part.vertices)
     return np.concatenate(vertices), np.concatenate(faces)
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from dt_viz.errors import FormatError
 from dt_viz.files.checks import too_many
-from dt_viz.files.columns import numbered, role_of, unnamed
+from dt_viz.files.columns import role_of
 
 
 @dataclass(frozen=True)
@@ -91,6 +91,8 @@ class Table:
     """Names of columns that were not read."""
     labels: tuple[str, ...] = ()
     """Texts of labels, of which the column of labels holds the indices."""
+    is_text: bool = False
+    """Whether it is text, in which the first of three columns without names may be times."""
 
 
 def imported(module: str, extra: str) -> Any:  # noqa: ANN401 - a module
@@ -157,13 +159,10 @@ def read_text(path: Path, options: ReadOptions) -> Iterator[Table]:
         number, _ = next(itertools.islice(_rows(path, skipped, delimiter), row, None))
         return f"at line {number}"
 
-    if not names:
-        matrix = np.stack([rows[f"f{k}"] for k in used], axis=1)
-        how = {"rated": options.rate is not None, "timed": True, "asks": options.asks}
-        names = numbered(width) if options.roles else unnamed(matrix, options.num_joints, **how)
-    columns = {names[k]: rows[f"f{k}"] for k in used}
     unused = tuple(name for k, name in enumerate(names) if k not in used)
-    yield Table(path.stem, columns, place, unused=unused, labels=tuple(labels))
+    values = [rows[f"f{k}"] for k in used]
+    columns = dict(zip([names[k] for k in used], values, strict=True)) if names else {"": np.stack(values, axis=1)}
+    yield Table(path.stem, columns, place, unused=unused, labels=tuple(labels), is_text=True)
 
 
 def _is_label(name: str, options: ReadOptions) -> bool:

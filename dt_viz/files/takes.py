@@ -164,13 +164,11 @@ def _named_columns(table: Table, options: ReadOptions) -> dict[str, np.ndarray]:
             columns |= expanded(name, values)
             continue
         rated = options.rate is not None or any(is_kind(other, "time") for other in table.columns)
-        names = options.names or (
-            numbered(values.shape[1])
-            if options.roles
-            else unnamed(values, options.num_joints, rated=rated, timed=False)
-        )
-        if len(names) != values.shape[1]:
-            raise FormatError("columns", f"{len(names)} names for {values.shape[1]} columns", "a name for each")
+        how = {"rated": rated, "timed": table.is_text, "asks": options.asks}
+        width = values.shape[1]
+        names = options.names or (numbered(width) if options.roles else unnamed(values, options.num_joints, **how))
+        if len(names) != width:
+            raise FormatError("columns", f"{len(names)} names for {width} columns", "a name for each")
         columns |= {name: values[:, k] for k, name in enumerate(names)}
     lower, taken = {name.lower(): name for name in columns}, {name.lower() for name in options.roles.values()}
     if missing := [name for name in options.roles.values() if name.lower() not in lower]:

@@ -1,17 +1,22 @@
-"""Process that reads a visitor's files within limits of memory, time and files, and ends.
+"""Process that reads visitors' files, each request in a process of its own with limits of memory, time and files.
 
-It imports what it needs, gives an empty line, and waits for files, or ends without them when its standard input is
-closed. It takes a line of JSON, what they are, the name and size of each, and options, and then the files. It gives a
-line of JSON, `{"value": …, "arrays": [names]}` as `dt_viz.files.values.packed` makes it, or `{"refused": [field, found,
-accepted]}`, and then the arrays as `numpy.save` writes them.
+It imports what it needs, gives an empty line, and waits for lines, until its standard input is closed. For each it has
+the file `request` of its temporary folder read: a line of JSON, what the files are, the name and size of each, and
+options, and then the files. The file `answer` is a line of JSON, `{"value": …, "arrays": [names]}` as
+`dt_viz.files.values.packed` makes it, or `{"refused": [field, found, accepted]}`, and then the arrays as `numpy.save`
+writes them. Then it gives a line, 0 or the code with which the reader has ended. Where processes cannot be forked, it
+reads itself.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import sys
+import tempfile
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,6 +26,8 @@ from dt_viz.files.recordings import Recordings, read_recordings
 from dt_viz.files.shapes import Points, Triangles, read_points, read_triangles
 from dt_viz.files.values import packed
 
+REQUEST, ANSWER = "request", "answer"
+"""Names of files in the temporary folder."""
 MEMORY = 2**30
 """Largest address space of the process, bytes."""
 READERS: Mapping[str, Callable[..., Any]] = {
@@ -37,10 +44,9 @@ def limit() -> None:
         import resource  # noqa: PLC0415 - not on Windows
     except ImportError:
         return
-    used = resource.getrusage(resource.RUSAGE_SELF)
     limits = {
         "RLIMIT_AS": MEMORY,
-        "RLIMIT_CPU": 15 + int(used.ru_utime + used.ru_stime) + 1,  # seconds for the file
+        "RLIMIT_CPU": 15,  # seconds
         "RLIMIT_FSIZE": 10**8,  # bytes of an answer
         "RLIMIT_NOFILE": 32,  # open files
         "RLIMIT_CORE": 0,
@@ -61,24 +67,47 @@ def answer(kind: str, files: list[tuple[str, bytes]], **options: Any) -> tuple[d
         return {"refused": ["file", f"data that need more than {MEMORY / 1e9:.0f} GB to read", "a smaller file"]}, []
     except Exception as error:  # no reader lists what corrupt bytes make it raise
         reason = " ".join(str(error).split())[:200] or type(error).__name__
-        return {"refused": ["file", f"something that cannot be read ({reason})", "a whole file of its kind"]}, []
+        return {
+            "refused": ["file", f"something that cannot be read ({reason})", f"a {Path(files[0][0]).suffix} file"]
+        }, []
     return {"value": value, "arrays": [*arrays]}, [*arrays.values()]
 
 
-def main() -> None:
-    """Read one request from the standard input."""
-    print(flush=True)
-    line = sys.stdin.buffer.readline()
-    if not line:
-        return
+def respond() -> None:
+    """Read the request, and write the answer."""
     limit()
-    kind, sizes, options = json.loads(line)
-    files = [(name, sys.stdin.buffer.read(size)) for name, size in sizes]
+    folder = Path(tempfile.gettempdir())
+    with (folder / REQUEST).open("rb") as file:
+        kind, sizes, options = json.loads(file.readline())
+        files = [(name, file.read(size)) for name, size in sizes]
     with np.errstate(all="ignore"):
         first, arrays = answer(kind, files, **options)
-    sys.stdout.buffer.write(json.dumps(first).encode() + b"\n")
-    for array in arrays:
-        np.save(sys.stdout.buffer, array, allow_pickle=False)
+    with (folder / ANSWER).open("wb") as file:
+        file.write(json.dumps(first).encode() + b"\n")
+        for array in arrays:
+            np.save(file, array, allow_pickle=False)
+
+
+def forked(work: Callable[[], None]) -> int:
+    """Do something in a process of its own, which ends with it; return its exit code."""
+    if not hasattr(os, "fork"):
+        work()
+        return 0
+    if process := os.fork():
+        return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
+    code = 1
+    try:
+        work()
+        code = 0
+    finally:
+        os._exit(code)
+
+
+def main() -> None:
+    """Read requests until there are no more."""
+    print(flush=True)
+    while sys.stdin.readline():
+        print(forked(respond), flush=True)
 
 
 if __name__ == "__main__":

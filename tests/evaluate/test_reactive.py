@@ -76,9 +76,9 @@ def test_a_second_obstacle_and_a_turned_box_count(engine):
     assert len(parts) == 2 and parts[0].wxyz == crossing.wxyz[0] != parts[1].wxyz
     np.testing.assert_allclose([part.position for part in parts], crossing.at(t))
     q, model = boxes.starts[:1], load_jaco().collision
-    run = reactive.Run(q=[q[0]], obstacle=[crossing.at(t)])
+    alone = reactive.Crossing(0, 0.0, crossing.at(t)[None], crossing.wxyz)
     expected = min(float(model.obstacle_distance(q, part)[0][0]) for part in parts)
-    assert reactive.smallest_distance(boxes, run, crossing) == pytest.approx(expected, abs=1e-9)
+    assert reactive.smallest_distance(boxes, reactive.Run([q[0]]), alone) == pytest.approx(expected, abs=1e-9)
 
 
 def test_the_smallest_distance_is_found_between_ticks_too(bench):
@@ -90,7 +90,7 @@ def test_the_smallest_distance_is_found_between_ticks_too(bench):
     dense = np.concatenate([(1 - fine) * a + fine * b for a, b in ((places[0], places[1]), (places[1], places[2]))])
     least = nearest(np.repeat(q[:1], len(dense), axis=0), dense, bench.diameter)
     crossing = reactive.Crossing(0, 0.0, places[:, None], [UPRIGHT])
-    found = reactive.smallest_distance(bench, reactive.Run(q=list(q), obstacle=list(places[:, None])), crossing)
+    found = reactive.smallest_distance(bench, reactive.Run(list(q)), crossing)
     assert found == pytest.approx(least, abs=1e-9)
     assert found < nearest(q[:3], places[:3], bench.diameter) - 0.01
 
@@ -99,10 +99,10 @@ def test_the_room_of_an_obstacle_that_comes_is_that_of_the_arm_as_it_is_then(ben
     q = np.stack([bench.starts[0], bench.starts[0] + 0.5])
     hands = bench.robot.end_effector(q)
     gone, far = np.full(3, np.nan), np.array([3.0, 0.0, 0.0])
-    crossing = reactive.Crossing(0, 0.0, np.zeros((2, 2, 3)), 2 * [UPRIGHT])
 
     def room(*centres):
-        return reactive.room_at_coming(bench, reactive.Run(q=list(q), obstacle=list(np.array(centres))), crossing)
+        crossing = reactive.Crossing(0, 0.0, np.array(centres), 2 * [UPRIGHT])
+        return reactive.room_at_coming(bench, reactive.Run(list(q)), crossing)
 
     assert room([far, gone], [hands[0], far]) > 1  # one has come before, the other is not there yet
     assert room([far, gone], [far, hands[1]]) < 0
@@ -112,9 +112,8 @@ def test_the_room_of_an_obstacle_that_comes_is_that_of_the_arm_as_it_is_then(ben
 
 def test_figures_of_a_run_are_relative_to_the_limits(bench):
     q = bench.starts[0] + np.cumsum([[0.0], [0.01], [0.03], [0.03]], axis=0) * np.eye(6)[0]
-    away = [np.array([[3.0, 0.0, 0.0]])] * 4
-    run = reactive.Run(list(q), [0.0, 0.01, 0.02, 0.03], away, [0.001, 0.003])
-    crossing = reactive.Crossing(0, 0.01, np.zeros((2, 1, 3)), [UPRIGHT])
+    crossing = reactive.Crossing(0, 0.01, np.array(4 * [[[3.0, 0.0, 0.0]]]), [UPRIGHT])
+    run = reactive.Run(list(q), [0.001, 0.003])
     found = reactive.figures_of(bench, crossing, run, 0.005)
     assert found["velocity"] == pytest.approx(3.0 / bench.robot.velocity_limits[0])
     assert found["acceleration"] == pytest.approx(200 / ControllerSettings().acceleration)
