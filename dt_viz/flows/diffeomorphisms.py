@@ -36,8 +36,7 @@ class Diffeomorphism(ABC):
     def scaled(self, fraction: float) -> Diffeomorphism:
         """The transform between the identity (fraction 0) and ψ (1): each flow runs for a fraction of its duration.
 
-        A flow becomes γ(fraction·t, ·), so scaled(a)∘scaled(b) = scaled(a + b). A chain becomes the chain of its scaled
-        parts.
+        A flow becomes γ(fraction·t, ·), so scaled(a)∘scaled(b) = scaled(a + b), and a chain that of its scaled parts.
         """
 
     def forward(self, y: Array) -> Array:

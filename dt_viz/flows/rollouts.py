@@ -42,8 +42,7 @@ class Rays:
     def times(self, index: Indices, fraction: Array) -> Array:
         """Times (N,), seconds, at which the motions are at the points that `at` gives; `index` must not decrease.
 
-        The goal counts as reached at the distance `ARRIVED`, or at a smaller one where other samples are nearer: no two
-        samples share a time.
+        The goal counts as reached at the distance `ARRIVED`, or nearer, so that no two samples share a time.
         """
         radius = self.base.left(self.z0)
         left = (1 - fraction) * radius[index]

@@ -290,7 +290,7 @@ def smoothed_turns(take: Repaired, vectors: Array, settings: PreparationSettings
 class _Grid:
     """Even times over a take, at most 2,000, and positions there with a small second difference.
 
-    f = argmin Σ_i ‖x_i − f(node of t_i)‖² + λ Σ ‖second difference of f‖². It passes frequencies far below the cut-off
+    f = argmin Σ_i ‖x_i − f(node of t_i)‖² + λ Σ ‖second difference of f‖² passes frequencies far below the cut-off
     1/(2π) (c/λ)^¼ / h, for c samples at each node and a distance h of the nodes; where no samples are, it is a cubic.
     """
 

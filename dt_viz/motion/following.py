@@ -225,11 +225,9 @@ class Follower:
     ) -> Iterator[tuple[Posture | None, Mask]]:
         """The postures with most room at the task's starts and goal, the best first: the usual one where it has enough.
 
-        But the posture `last`, if it is not the usual one, comes before all that leave no more starts free; where it
-        is kept, before all, if it leaves the goal and any start free.
-
-        Yields:
-            A reference posture, None for the usual one; which of the starts and the goal (R + 1,) it leaves free.
+        But the posture `last`, if it is not the usual one, comes before all that leave no more starts free; where it is
+        kept, before all, if it leaves the goal and any start free. With each reference posture, None for the usual one,
+        comes which of the starts and the goal (R + 1,) it leaves free.
         """
         room = self.whole_arm.clearance(self._demonstrated(learned, last).pins, obstacle, margin)
         is_ample = last is None and bool((room >= margin).all())
