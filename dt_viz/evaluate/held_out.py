@@ -24,7 +24,6 @@ from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.augmented import AugmentedImitation
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.interface import AnyImitation
-from dt_viz.learning.poses import Poses
 from dt_viz.metrics import arc_length, discrete_frechet, resample_by_arc_length, rms_at_equal_times
 
 WAYS = ("learned", "mean", "nearest")
@@ -108,10 +107,10 @@ def degrees_off(
     return {way: np.rad2deg(apart(orientations, wanted)) for way, orientations in found.items()}
 
 
-def _turns(poses: Poses, demonstration: Demonstration) -> Array:
+def _turns(poses: AugmentedImitation, demonstration: Demonstration) -> Array:
     """Rotation vectors (`NUM_COMPARED`, 3) of a demonstration, times a radius, evenly along the way of its pose."""
-    assert demonstration.orientations is not None
-    vectors = poses.imitation.radius * logarithm(poses.goal_orientation, demonstration.orientations)
+    assert demonstration.orientations is not None and poses.goal_orientation is not None
+    vectors = poses.radius * logarithm(poses.goal_orientation, demonstration.orientations)
     return resample_by_arc_length(np.hstack([demonstration.positions, vectors]), NUM_COMPARED)[:, 3:]
 
 

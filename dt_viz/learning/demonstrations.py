@@ -92,16 +92,11 @@ def check_demonstrations(
 ) -> tuple[Demonstration, ...]:
     """Check recorded motions and bring them into the one form that the rest of the program trusts.
 
-    Every loader ends here; motions recorded in memory go through it as well.
+    Every loader ends here; motions recorded in memory, of any real number type and from any time on, do as well.
+    The source, a file or recording, is for messages, and so is, for each demonstration, what describes the place of a
+    sample in it; without `places`, samples are counted from 1.
 
-    Args:
-        demonstrations: times ``(T,)`` in seconds from any start, positions ``(T, d)`` in metres, any real number type.
-        source: the file or recording, for messages.
-        places: for each demonstration, what describes the place of a sample in the file, for messages;
-            without it, samples are counted from 1.
-
-    Returns:
-        The same motions with times from 0, as read-only float64 arrays.
+    Returns the same motions with times from 0, as read-only float64 arrays.
 
     Raises:
         DemonstrationError: there are none, or too many; they differ in dimension; or one of them has not the shapes,
@@ -140,13 +135,10 @@ def samples_of(
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return the times (T,) from 0 and the positions (T, d) of demonstrations as new float64 arrays.
 
-    Args:
-        demonstrations: recorded motions.
-        places: as in :func:`check_demonstrations`.
-
     Raises:
         FormatError: there are none, they differ in dimension, or one of them has not the shapes, the number of samples,
-            the finite values or the increasing times that :class:`Demonstration` promises.
+            the finite values or the increasing times that :class:`Demonstration` promises. It says where by `places`,
+            as :func:`check_demonstrations` does.
     """
     if not demonstrations:
         raise FormatError("demonstrations", "none", "at least one")
@@ -230,7 +222,7 @@ def load_demonstrations(
             package that is not installed, has columns that are not clear, or holds demonstrations that
             :func:`check_demonstrations` refuses; or there are times beside a rate, or joint angles without an arm.
     """
-    options = ReadOptions(rate, unit, columns, topic, () if arm is None else tuple(arm.joint_names))
+    options = ReadOptions(rate, unit, columns, topic, _joints(arm))
     sources = [Path(path)] if isinstance(path, str | Path) else [*map(Path, path)]
     found = [read for source in sources for read in _found_in(source, options)]
     return demonstrations_of(found, ", ".join(map(str, sources))[:200], arm)
@@ -240,28 +232,22 @@ def read_demonstrations(
     content: bytes,
     source: str | Path,
     *,
-    rate: float | None = None,
-    unit: str | None = None,
-    columns: str | Sequence[str] | Mapping[str, str] | None = None,
-    topic: str | None = None,
     arm: ForwardKinematics | None = None,
+    **options: Any,  # noqa: ANN401
 ) -> tuple[Demonstration, ...]:
-    """Read the demonstrations in the bytes of a file; arguments and errors as of :func:`load_demonstrations`.
+    """Read the demonstrations in all bytes of a file; options and errors as of :func:`load_demonstrations`.
 
-    Args:
-        content: all bytes of the file.
-        source: its name or path; the suffix says what it is, the stem names demonstrations that have no name.
-        rate: see there.
-        unit: see there.
-        columns: see there.
-        topic: see there.
-        arm: see there.
+    The suffix of the source, a name or path, says what it is; its stem names demonstrations that have no name.
     """
-    options = ReadOptions(rate, unit, columns, topic, () if arm is None else tuple(arm.joint_names))
+    wanted = ReadOptions(**options, joint_names=_joints(arm))
     with TemporaryDirectory() as folder:
         path = Path(folder, Path(source).name)
         path.write_bytes(content)
-        return demonstrations_of([(Path(source), *_read(path, source, options)[1:])], source, arm)
+        return demonstrations_of([(Path(source), *_read(path, source, wanted)[1:])], source, arm)
+
+
+def _joints(arm: ForwardKinematics | None) -> tuple[str, ...]:
+    return () if arm is None else tuple(arm.joint_names)
 
 
 def demonstrations_of(
@@ -269,13 +255,8 @@ def demonstrations_of(
 ) -> tuple[Demonstration, ...]:
     """Make demonstrations of the takes of one or several files; log lines say what was recognised or is not used.
 
-    Args:
-        found: for each file its path, its takes and notes about them, as `read_takes` gives them.
-        source: the files or the folder, for messages.
-        arm: as for :func:`load_demonstrations`.
-
-    Raises:
-        DemonstrationError: as :func:`load_demonstrations`.
+    For each file its path, its takes and notes about them are given, as `read_takes` gives them; the source, all files
+    or their folder, is for messages. Raises as :func:`load_demonstrations`.
     """
     said: dict[str, list[Path]] = {}
     for path, _, notes in found:
@@ -366,10 +347,7 @@ def save_demonstrations(path: str | Path, demonstrations: Sequence[Demonstration
 
 
 def lasa_files(folder: str | Path) -> dict[str, Path]:
-    """List the shapes of a LASA folder by name, without reading them: load one with :func:`load_demonstrations`.
-
-    Args:
-        folder: holds one ``.mat`` file per shape, such as ``Sshape.mat``.
+    """List the shapes of a LASA folder, one ``.mat`` file each, by name: load one with :func:`load_demonstrations`.
 
     Raises:
         DemonstrationError: there is no such folder, it cannot be read, or it holds no ``.mat`` file.

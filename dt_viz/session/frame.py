@@ -201,7 +201,7 @@ class Frame:
     @property
     def labels(self) -> tuple[float, ...]:
         """Label of each demonstration; an added start may have one of them. None where no labels are needed."""
-        return self.motion.nominal.learned.demonstrated_labels
+        return self.motion.nominal.imitation.labels or ()
 
     @property
     def learned_steps(self) -> tuple[int, ...]:
