@@ -284,7 +284,7 @@ def recorded_seeds() -> Iterator[tuple[str, str, bytes, tuple[Mutation, ...]]]:
         for suffix, path in paths.items():
             if suffix not in (".tsv", ".txt", ".dat", ".h5"):  # read as others are
                 own = (with_changed_members,) * 4 if suffix == ".npz" else ()
-                for kind in ("takes", "demonstrations"):
+                for kind in ("takes", "demonstrations")[: 1 + (suffix != ".mat")]:  # which may end the program
                     yield kind, path.name, path.read_bytes(), own
 
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import struct
-import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -54,7 +52,6 @@ def read_npy(path: Path, options: ReadOptions) -> Iterator[Table]:
 
 def read_mat(path: Path, options: ReadOptions) -> Iterator[Table]:
     """Read MATLAB variables; ``demos``, a cell array of structures with t and pos, is LASA's, in millimetres."""
-    _check_matlab(path.read_bytes())
     variables = scipy.io.loadmat(path, simplify_cells=True)
     if "demos" not in variables:
         yield from tables_of(
@@ -72,30 +69,6 @@ def read_mat(path: Path, options: ReadOptions) -> Iterator[Table]:
         if positions.ndim != 2 or len(positions) not in (2, 3):
             raise FormatError(f"demos{{{i + 1}}}.pos", f"an array of shape {positions.shape}", "d×T, d is 2 or 3")
         yield Table(f"{path.stem} {i}", {"t": times, "pos": positions.T}, units=LASA_UNITS)
-
-
-def _check_matlab(content: bytes) -> None:
-    """Raise FormatError if a MATLAB file has elements of unknown types, which crash scipy's reader."""
-    if len(content) >= 128 and all(content[:4]):  # version 4 has no text there, and 7.3 is refused by scipy
-        _check_elements(memoryview(content)[128:], ">" if content[126:128] == b"MI" else "<")
-
-
-def _check_elements(data: memoryview, order: str) -> None:
-    """Check the elements that follow each other in a MATLAB file of version 5, or in a part of it."""
-    place = 0
-    while place < len(data):
-        kind, size = struct.unpack_from(f"{order}II", data, place)
-        place += 8
-        if not 1 <= kind & 0xFFFF <= 18 or (kind < 2**16 and size > len(data) - place):
-            raise FormatError("file", f"a broken element of type {kind & 0xFFFF}", "a whole MATLAB file")
-        if kind == 15:  # compressed
-            unpacked = zlib.decompressobj().decompress(data[place : place + size], LIMITS.bytes + 1)
-            check_size(len(unpacked), LIMITS.bytes)
-            _check_elements(memoryview(unpacked), order)
-        elif kind == 14:  # made of elements
-            _check_elements(data[place : place + size], order)
-        if kind < 2**16:  # the data of others stand in the place of their size
-            place += size + (-size % 8 if kind != 15 else 0)
 
 
 def read_json(path: Path, options: ReadOptions) -> Iterator[Table]:

@@ -35,6 +35,8 @@ def arrays_of(content: bytes | Path, *, max_bytes: int, names: Collection[str] |
         raise FormatError("file", f"{size} bytes when unpacked", f"at most {max_bytes} bytes")
     if names is not None and not names:
         return {}
+    if isinstance(file, io.BytesIO):
+        file.seek(0)
     arrays = {}
     with np.load(file, allow_pickle=False) as archive:
         for name in archive.files if names is None else [name for name in names if name in archive.files]:

@@ -97,6 +97,7 @@ def forked(work: Callable[[], None]) -> int:
         return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
     code = 1
     try:
+        os.dup2(2, 1)  # what readers print is no code
         work()
         code = 0
     finally:

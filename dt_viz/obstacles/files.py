@@ -1,13 +1,4 @@
-"""Obstacles' shapes from files: closed meshes and point clouds.
-
-Meshes, in metres (or scaled to them): STL, OBJ, PLY, GLB, glTF with its data inside, OFF, 3MF. They must be closed, but
-for small holes (see `dt_viz.files.repair`).
-
-Point clouds, in metres (or scaled to them):
-    PLY (``.ply``): the vertices, with labels if they have a property ``occupied``, ``occupancy`` or ``label``.
-    npz (``.npz``): ``points`` (K, 3), and optionally ``labels`` (K,). Pickled arrays are never opened.
-    CSV (``.csv``), UTF-8: a header line with ``x``, ``y``, ``z`` and optionally ``occupied``, and one line per point.
-    Labels are 1 (occupied) or 0 (free); without them every point is occupied.
+"""Obstacles' shapes from files of closed meshes and point clouds; see the table in `dt_viz/files/README.md`.
 
 The origin of a shape is moved to the middle of its bounding box. Files are read by a process of their own
 (`dt_viz.files.uploads`).

@@ -77,7 +77,14 @@ def test_what_it_does_beyond_its_limits_ends_it_and_nothing_else(reader, hostile
 
 @pytest.mark.parametrize(
     "answer",
-    ["[], []", "{}, []", "{'refused': 3}, []", "{'value': {}, 'arrays': []}, []", "{'value': {}, 'arrays': ['a']}, []"],
+    [
+        "print(3, flush=True), []",
+        "[], []",
+        "{}, []",
+        "{'refused': 3}, []",
+        "{'value': {}, 'arrays': []}, []",
+        "{'value': {}, 'arrays': ['a']}, []",
+    ],
 )
 def test_any_other_answer_is_one_line_for_the_page(reader, answer):
     reader(f"return {answer}")
