@@ -23,13 +23,9 @@ class Memo:
         self._results: defaultdict[str, dict[Hashable, Any]] = defaultdict(dict)
 
     def __call__(self, kind: str, key: Hashable, make: Callable[[], _Result], *, newest: int | None = None) -> _Result:
-        """The result for a key: what is kept, or else what `make` returns now. What it raises is not kept.
+        """The result of a kind for a key, all that `make` computes from: what is kept, or else what it returns now.
 
-        Args:
-            kind: of the results, which have keys and a size of their own.
-            key: all that `make` computes from.
-            make: computes the result.
-            newest: number of results of this kind that are kept, those used last; None keeps all.
+        What it raises is not kept. Each kind keeps the `newest` results, those used last; None keeps all.
         """
         with self._lock:
             results = self._results[kind]
@@ -51,12 +47,9 @@ class Memo:
 def kept(
     newest: int | None = None, by: Callable[..., Hashable] = lambda *given: given, of: str = "memo"
 ) -> Callable[[_Method], _Method]:
-    """Decorate a method whose newest results its object keeps.
+    """Decorate a method whose newest results its object keeps in its `Memo`, the attribute `of`; None keeps all.
 
-    Args:
-        newest: number of results that are kept; None keeps all.
-        by: what a result depends on, of the method's arguments.
-        of: name of the object's attribute that is the `Memo`.
+    `by` gives what a result depends on, of the method's arguments.
     """
 
     def decorate(method: _Method) -> _Method:

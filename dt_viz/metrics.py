@@ -12,27 +12,15 @@ from dt_viz.numerics import divisor
 
 
 def arc_length(points: np.ndarray) -> np.ndarray:
-    """Return the length of polylines from their first point up to each point.
-
-    Args:
-        points: shape ``(*B, T, d)``.
-
-    Returns:
-        Shape ``(*B, T)``, from 0 up to the whole length, which is ``[..., -1]``.
-    """
+    """Return the lengths (*B, T) of polylines (*B, T, d) from their first point up to each point."""
     steps = np.linalg.norm(np.diff(points, axis=-2), axis=-1)
     return np.concatenate([np.zeros_like(steps[..., :1]), np.cumsum(steps, axis=-1)], axis=-1)
 
 
 def resample_by_arc_length(points: np.ndarray, n: int) -> np.ndarray:
-    """Return ``n`` points at equal distances along a polyline, the first and the last being its own.
+    """Return `n` ≥ 2 points (n, d) at equal distances along a polyline (T, d), the first and the last being its own.
 
-    Args:
-        points: shape ``(T, d)``; successive points may coincide.
-        n: number of points, at least 2.
-
-    Returns:
-        Shape ``(n, d)``.
+    Successive points may coincide.
     """
     length = arc_length(points)
     keep = np.concatenate([[True], np.diff(length) > 0])
@@ -42,33 +30,20 @@ def resample_by_arc_length(points: np.ndarray, n: int) -> np.ndarray:
 
 
 def interpolate(at: np.ndarray, parameter: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Interpolate linearly between points, holding the first and last beyond the ends.
+    """Interpolate points (T, d) at an increasing parameter (T,), such as time, linearly `at` others (N,), as (N, d).
 
-    Args:
-        at: where, shape ``(N,)``.
-        parameter: the increasing parameter (time, arc length) of each point, shape ``(T,)``.
-        points: shape ``(T, d)``.
-
-    Returns:
-        Shape ``(N, d)``.
+    The first and last point hold beyond the ends.
     """
     return np.stack([np.interp(at, parameter, coordinate) for coordinate in points.T], axis=1)
 
 
 def discrete_frechet(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the discrete Fréchet distance between the points of two paths, exactly.
+    """Return the discrete Fréchet distances (*B,) between the points of paths (*B, n, d) and (*B, m, d), exactly.
 
     The least, over all ways of stepping forward along both from their first to their last points, of the largest
-    distance met: F(i, j) = max(‖a_i − b_j‖, min(F(i−1, j), F(i, j−1), F(i−1, j−1))) (Eiter and Mannila, 1994).
-    A cell of the anti-diagonal i + j = k depends only on the two anti-diagonals before it, so each of them is
-    computed at once, and for all pairs of a batch together.
-
-    Args:
-        a: shape ``(*B, n, d)``.
-        b: shape ``(*B, m, d)``, its leading axes broadcast with those of ``a``.
-
-    Returns:
-        Shape ``(*B,)``; for a single pair a 0-d value that ``float`` takes.
+    distance met: F(i, j) = max(‖a_i − b_j‖, min(F(i−1, j), F(i, j−1), F(i−1, j−1))) (Eiter and Mannila, 1994). A cell
+    of the anti-diagonal i + j = k depends only on the two anti-diagonals before it, so each of them is computed at
+    once, and for all pairs of a batch together. Leading axes are broadcast; that of a single pair is a 0-d value.
     """
     if a.shape[-2] > b.shape[-2]:
         a, b = b, a  # the sweep is as wide as the first is long
@@ -107,15 +82,11 @@ def _skewed(table: np.ndarray, fill: float) -> np.ndarray:
 
 
 def dynamic_time_warping(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the least sum of distances between matched points of two paths.
+    """Return the least sum of distances between matched points of two paths, (n, d) and (m, d).
 
     Matched are pairs on a way that steps forward along one path, the other, or both, from their first to their last
     points: D(i, j) = ‖a_i − b_j‖ + min(D(i−1, j), D(i, j−1), D(i−1, j−1)) (Sakoe and Chiba, 1978). The sum grows with
     the number of points.
-
-    Args:
-        a: shape ``(n, d)``.
-        b: shape ``(m, d)``.
     """
     distances = _skewed(np.linalg.norm(a[:, None] - b[None], axis=-1), np.inf)
     before, last = np.full((2, len(a) + 1), np.inf)  # of the last two anti-diagonals; place i + 1 is row i
@@ -127,15 +98,10 @@ def dynamic_time_warping(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def rms_jerk(times: np.ndarray, points: np.ndarray, interval: float) -> float:
-    """Return the root mean square of the third derivative of a motion, by differences between even times.
+    """Return the root mean square of the third derivative of a motion (T, d) at times (T,) that do not decrease.
 
-    Args:
-        times: shape ``(T,)``, not decreasing.
-        points: shape ``(T, d)``.
-        interval: time between the positions that are compared, in the unit of the times.
-
-    Returns:
-        Length per cubed time; 0 for a motion of less than three intervals.
+    It is that of differences between positions that an `interval` of time lies between, as length per cubed time; 0 for
+    a motion of less than three intervals.
     """
     at = np.arange(times[0], times[-1] + interval / 2, interval)
     jerk = np.diff(interpolate(at, times, points), 3, axis=0) / interval**3
@@ -145,27 +111,18 @@ def rms_jerk(times: np.ndarray, points: np.ndarray, interval: float) -> float:
 def rms_at_equal_times(
     times: np.ndarray, points: np.ndarray, reference_times: np.ndarray, reference_points: np.ndarray
 ) -> float:
-    """Return the root mean square distance of a motion from a reference, at the times of the reference.
+    """Return the root mean square distance of a motion (T, d) from a reference (R, d), at the times (R,) of this.
 
-    Args:
-        times: shape ``(T,)``, increasing; the motion rests at its first point before and at its last point after.
-        points: shape ``(T, d)``.
-        reference_times: shape ``(R,)``, same unit as ``times``.
-        reference_points: shape ``(R, d)``.
+    The motion rests at its first point before its increasing times (T,), and at its last point after.
     """
     error = interpolate(reference_times, times, points) - reference_points
     return float(np.sqrt((error**2).sum(axis=1).mean()))
 
 
 def distance_from_path(points: np.ndarray, path: np.ndarray) -> np.ndarray:
-    """Return how far points are from a polyline, also between its points.
+    """Return how far points (N, d) are from a polyline (T, d), T ≥ 2, also between its points, (N,).
 
-    Args:
-        points: shape ``(N, d)``.
-        path: shape ``(T, d)``, T at least 2; successive points may coincide.
-
-    Returns:
-        Shape ``(N,)``.
+    Successive points may coincide.
     """
     step = np.diff(path, axis=0)
     from_start = points[:, None] - path[:-1]
@@ -176,15 +133,14 @@ def distance_from_path(points: np.ndarray, path: np.ndarray) -> np.ndarray:
 def maximum_collision_distance(
     points: np.ndarray, signed_distance: Callable[[np.ndarray], np.ndarray], tolerance: float = 1e-5
 ) -> float:
-    """Return how deep a polyline enters an obstacle (M.C.D., sec. 5), also between its points; 0 when it is clear.
+    """Return how deep a polyline (T, d) enters an obstacle (M.C.D., sec. 5), also between its points; 0 if it is clear.
 
-    A signed distance changes no faster than the point moves, so on a segment of length L whose ends have distances
-    d₀ and d₁ it is at least (d₀ + d₁ − L)/2. Segments that could still hold a deeper point are halved until none can.
+    A signed distance changes no faster than the point moves, so on a segment of length L whose ends have distances d₀
+    and d₁ it is at least (d₀ + d₁ − L)/2. Segments that could still hold a deeper point are halved until none can.
 
     Args:
-        points: shape ``(T, d)``.
-        signed_distance: takes points ``(N, d)`` and returns ``(N,)``, negative inside. It may be smaller than the
-            true distance, but its slope must nowhere exceed 1.
+        points: of the polyline.
+        signed_distance: of points (N, d), (N,), negative inside; its slope must nowhere exceed 1.
         tolerance: how far the result may stay below the true depth, in the unit of the points.
     """
     distance = signed_distance(points)
@@ -204,17 +160,11 @@ def maximum_collision_distance(
 
 
 def sharpest_turn(path: np.ndarray, window: float) -> float:
-    """Return the largest angle between two tangents that lie on a common piece of the path of length ``window``.
+    """Return the largest angle, degrees, between tangents on a common piece of a path (T, d) of length `window` > 0.
 
-    Exact for the polyline: two of its segments count when the path between them is shorter than the window.
-    Adding points on its segments changes nothing. A smooth curve wants samples much closer than the window.
-
-    Args:
-        path: shape ``(T, d)``; successive points may coincide.
-        window: length of the piece, in the unit of the path, greater than 0.
-
-    Returns:
-        Degrees from 0 (straight, or fewer than two segments) to 180 (turns back on itself).
+    Exact for the polyline: two of its segments count when the path between them is shorter than the window. Points may
+    coincide, and more of them on its segments change nothing. A smooth curve wants samples much closer than the window.
+    0 is straight, or fewer than two segments; 180 turns back on itself.
     """
     steps = np.diff(path, axis=0)
     length = np.linalg.norm(steps, axis=1)

@@ -12,14 +12,11 @@ others
 from __future__ import annotations
 
 import json
-import math
 import os
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import UnionType
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any
 
-import msgspec
 import numpy as np
 
 from dt_viz.avoidance import registry
@@ -28,6 +25,7 @@ from dt_viz.avoidance.transform import Transform
 from dt_viz.errors import DataError, FormatError, check_between, parsing
 from dt_viz.files.checks import read_bytes
 from dt_viz.files.npz import arrays_of, npz_bytes, write_whole
+from dt_viz.files.values import CLASS, packed, unpacked
 from dt_viz.learning.augmented import AugmentedImitation, fit_augmented
 from dt_viz.learning.demonstrations import MAX_COORDINATE, Demonstration, check_demonstrations
 from dt_viz.learning.imitation import Imitation
@@ -43,12 +41,6 @@ FORMAT = 1
 arrays. A new field that has a default does not need that."""
 MAX_BYTES = 40 * 10**6
 """Largest number of bytes of a file, and of what it unpacks to."""
-CLASS = "class"
-"""Key of the name of an object's class."""
-CLASSES = {Transform: lambda: registry.KINDS, Obstacle: lambda: SHAPES}
-"""Classes whose objects may stand where a field is annotated with a base class or a protocol."""
-SCALARS = {bool: "true or false", int: "an integer", float: "a finite number", str: "text"}
-"""Types of scalars, and their names in messages."""
 TEXT, LEARNED = "motion", "imitation."
 """Name of the array that holds the text, and prefix of those of the imitation."""
 
@@ -86,7 +78,7 @@ def save_motion(path: str | os.PathLike[str], motion: SavedMotion, imitation: An
     """
     path, arrays = Path(path), dict[str, np.ndarray]()
     with parsing(MotionError, path, "motion", "what Motion.load can read"):
-        plain = {"version": FORMAT, **_plain(motion, "motion", arrays)}
+        plain = {"version": FORMAT, **packed(motion, "motion", arrays)}
         text = json.dumps(plain, default=lambda number: number.item())  # numpy's
     learned = {LEARNED + name: array for name, array in imitation.to_arrays().items()}
     content = npz_bytes({TEXT: np.array(text)} | learned | arrays)
@@ -118,13 +110,16 @@ def read_motion(content: bytes, source: str | Path) -> tuple[SavedMotion, AnyImi
         text = arrays.pop(TEXT, np.zeros(0))
         if text.dtype.kind != "U" or text.ndim:
             raise FormatError("arrays", "no text that describes a motion", "a file that Motion.save wrote")
-        plain = json.loads(str(text))
+        plain = json.loads(str(text), object_hook=_from_before)
         json.dumps(plain, ensure_ascii=False).encode()  # fails at half a character, which nothing could show
         version = plain.pop("version", None) if isinstance(plain, dict) else None
         if version != FORMAT:
             raise FormatError("version", repr(version)[:40], f"{FORMAT}; another version of DT-Viz may have saved it")
-        arrays = {name: _written(array, name) for name, array in arrays.items()}
-        motion: SavedMotion = _made(plain, SavedMotion, "motion", arrays)
+        for name, array in arrays.items():  # smaller numbers would grow eightfold when they are used
+            if array.dtype not in (np.float64, np.int64) and array.dtype.kind != "U":
+                raise FormatError(f"array {name[:40]!r}", f"values of type {array.dtype}", "float64, int64 or text")
+        classes = {Transform: registry.KINDS, Obstacle: SHAPES}
+        motion: SavedMotion = unpacked(plain, SavedMotion, "motion", arrays, classes)
         learned = {name.removeprefix(LEARNED): array for name, array in arrays.items() if name.startswith(LEARNED)}
         demonstrations = check_demonstrations(motion.demonstrations, source)
         imitation = _again(motion) if motion.augmented else Imitation.from_arrays(learned)
@@ -146,94 +141,12 @@ def _again(motion: SavedMotion) -> AugmentedImitation:
         raise FormatError("demonstrations", str(error), "some that a motion is learned from") from error
 
 
-def _plain(value: Any, where: str, arrays: dict[str, np.ndarray]) -> Any:  # noqa: ANN401 - what JSON can hold
-    """Return a value as JSON holds it, and put its arrays into `arrays`, by their place in the whole."""
-    if isinstance(value, np.ndarray):
-        arrays[where] = value.astype(np.int64 if value.dtype.kind in "iu" else np.float64)
-        return where
-    if isinstance(value, tuple | list):
-        return [_plain(item, f"{where}[{k}]", arrays) for k, item in enumerate(value)]
-    if is_dataclass(value):
-        names = [field.name for field in fields(value)]
-        held = {name: _plain(getattr(value, name), f"{where}.{name}", arrays) for name in names}
-        return {CLASS: type(value).__name__, **held}
-    return value
-
-
-def _made(plain: Any, hint: Any, where: str, arrays: dict[str, np.ndarray]) -> Any:  # noqa: ANN401 - of this type
-    """Return the value that `_plain` wrote, made by constructors, and take its arrays out of `arrays`.
-
-    Args:
-        plain: what JSON holds.
-        hint: annotation of the value; fields that are not there have their defaults.
-        where: place of the value in the whole, for messages.
-        arrays: arrays by their names.
-
-    Raises:
-        FormatError: it is not what the annotation says, or its class refuses it.
-    """
-    kinds, origin = get_args(hint), get_origin(hint)
-    if origin in (Union, UnionType):  # X | None
-        return None if plain is None else _made(plain, kinds[0], where, arrays)
-    if origin is tuple:
-        items = _checked(plain, isinstance(plain, list), where, "a list")
-        kinds = kinds[:1] * len(items) if kinds[-1] is Ellipsis else kinds
-        _checked(items, len(items) == len(kinds), where, f"{len(kinds)} values")
-        return tuple(_made(items[k], kinds[k], f"{where}[{k}]", arrays) for k in range(len(kinds)))
-    if np.ndarray in (
-        hint,
-        origin,
-        get_origin(getattr(origin, "__value__", None)),
-    ):  # NDArray is an alias since numpy 2.5
-        array = arrays.pop(plain, None) if isinstance(plain, str) else None  # each once, or a few bytes fill the memory
-        wanted = np.int64 if "integer" in repr(kinds) else np.float64
-        fits = array is not None and array.dtype == wanted and bool(np.isfinite(array).all())
-        _checked(plain, fits, where, f"the name of an array of finite {wanted.__name__}")
-        return array
-    if hint in CLASSES or is_dataclass(hint):
-        return _object(plain, hint, where, arrays)
-    try:
-        value = msgspec.convert(plain, hint)
-        fits = not isinstance(value, float) or math.isfinite(value)
-    except msgspec.ValidationError:
-        value, fits = plain, False
-    accepted = " or ".join(map(repr, kinds)) or SCALARS.get(hint, f"{hint}")
-    return _checked(value, fits, where, accepted)
-
-
-def _object(plain: Any, hint: Any, where: str, arrays: dict[str, np.ndarray]) -> object:  # noqa: ANN401
-    """Return an object of a class, or of one of the classes that the file may name. Raises as `_made`."""
-    held = dict(_checked(plain, isinstance(plain, dict), where, "an object"))
-    name = held.pop(CLASS, None)
-    if hint in CLASSES:
-        kinds = {kind.__name__: kind for kind in CLASSES[hint]()}
-        if name == Avoidance.__name__:  # versions before 0.1 had one kind, with a field
-            space = held.pop("space", "task")
-            name = Avoidance.kinds[
-                _checked(space, space in list(SPACES), f"{where}.space", " or ".join(SPACES))
-            ].__name__
-            held = {name: held[name] for name in held if space == "task" or name != "plane"}
-        hint = kinds[_checked(name, name in list(kinds), f"{where}.{CLASS}", " or ".join(kinds))]
-    hints = {field.name: get_type_hints(hint)[field.name] for field in fields(hint)}
-    for name in held:
-        _checked(name, name in hints, f"fields of {where}", ", ".join(hints))
-    values = {name: _made(plain, hints[name], f"{where}.{name}", arrays) for name, plain in held.items()}
-    try:
-        return hint(**values)
-    except FormatError as error:
-        raise FormatError(f"{where}.{error.field}", error.found, error.accepted) from error
-    except TypeError as error:
-        raise FormatError(where, f"too few fields ({error})", ", ".join(hints)) from error
-
-
-def _checked(plain: Any, fits: bool, where: str, accepted: str) -> Any:  # noqa: ANN401 - the same
-    if not fits:
-        raise FormatError(where, repr(plain)[:40], accepted)
-    return plain
-
-
-def _written(array: np.ndarray, name: str) -> np.ndarray:
-    """Return an array of the numbers that are written; smaller ones would grow eightfold when they are used."""
-    if array.dtype not in (np.float64, np.int64) and array.dtype.kind != "U":
-        raise FormatError(f"array {name[:40]!r}", f"values of type {array.dtype}", "float64, int64 or text")
-    return array
+def _from_before(plain: dict[str, Any]) -> dict[str, Any]:
+    """Name the kind of an avoidance; versions before 0.1 had one, with a field."""
+    if plain.get(CLASS) != Avoidance.__name__:
+        return plain
+    space = plain.pop("space", "task")
+    if space not in SPACES:
+        raise FormatError("space", repr(space)[:40], " or ".join(SPACES))
+    held = {name: plain[name] for name in plain if space == "task" or name != "plane"}
+    return held | {CLASS: Avoidance.kinds[space].__name__}

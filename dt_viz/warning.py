@@ -31,15 +31,10 @@ class Concern(Enum):
     TOO_CLOSE = "too close"
     CAUTION = "caution"
 
-    @property
-    def severity(self) -> Severity:
-        """How grave it is."""
-        return Severity.ALARM if self is Concern.COLLISION else Severity.WARNING
-
-    @property
-    def gravity(self) -> int:
+    def __init__(self, _name: str) -> None:
+        self.gravity = len(type(self).__members__)
         """Place among all concerns, 0 for the gravest."""
-        return list(Concern).index(self)
+        self.severity = Severity.WARNING if self.gravity else Severity.ALARM
 
 
 class Mend(Enum):
@@ -56,7 +51,7 @@ class Mend(Enum):
 class Kind(Enum):
     """Kind of a problem, with its concern, its remedy if there is one, and the name of the kind that is its cause.
 
-    A warning is hidden by one of its cause.
+    A warning is hidden by one of its cause. Kinds of the motion come first, then those of the arm, then certificates.
     """
 
     concern: Concern
@@ -78,17 +73,13 @@ class Kind(Enum):
     IMITATION = Concern.CAUTION
     """The demonstrations were not learned as they are."""
     START_COVERED = Concern.CAUTION
-    """A motion starts inside an obstacle."""
     GOAL_COVERED = Concern.CAUTION
-    """The goal lies inside an obstacle."""
     STAYS_INSIDE = Concern.COLLISION, Mend.FLOW
     """No flow time leads a motion out of an obstacle."""
     ENTERS = Concern.COLLISION, Mend.FLOW, "STAYS_INSIDE"
-    """A motion enters an obstacle."""
     TOO_NEAR = Concern.TOO_CLOSE, Mend.FLOW
     """A motion keeps less than the margin from an obstacle."""
     GOAL_MISSED = Concern.CAUTION, None, "GOAL_COVERED"
-    """The motions end beside the goal."""
     MISPLACED = Concern.CAUTION
     """A transform stands at a place where it has no effect."""
     OFF_PLANE = Concern.CAUTION
@@ -100,7 +91,6 @@ class Kind(Enum):
     UNSAMPLED = Concern.INEXACT
     """The motions are stretched too far to be drawn exactly."""
     OUT_OF_REACH = Concern.CAUTION
-    """The arm cannot reach a place."""
     PATH_MISSED = Concern.CAUTION
     """The joints do not lead the hand along its path."""
     HAND_TURNED = Concern.CAUTION
@@ -112,13 +102,11 @@ class Kind(Enum):
     ROLLOUT_ENTERS = Concern.COLLISION, Mend.FLOW
     """The arm, avoiding as a whole, enters an obstacle on some rollout."""
     ARM_TOO_NEAR = Concern.TOO_CLOSE, Mend.FLOW
-    """The arm, avoiding as a whole, keeps less than the margin from an obstacle on some rollout."""
+    """The same nearer than the margin."""
     ARM_ENTERS = Concern.COLLISION, Mend.WHOLE_ARM, "ROLLOUT_ENTERS"
     """The arm that is shown enters an obstacle."""
     ARM_HITS_ITSELF = Concern.TOO_CLOSE
-    """The arm that is shown touches itself, nearly or indeed."""
     ARM_BELOW_TABLE = Concern.COLLISION
-    """The arm that is shown goes through the table."""
     DAMPED = Concern.CAUTION
     """The pseudo-inverse of the arm's Jacobian is damped."""
     FOLDS = Concern.INEXACT, Mend.INTEGRATION
@@ -126,13 +114,13 @@ class Kind(Enum):
     INEXACT_INVERSE = Concern.INEXACT, Mend.INTEGRATION
     """An integrator that was chosen by hand does not come back to where it began."""
     NO_DIFFEOMORPHISM = Concern.INEXACT, None, "FOLDS"
-    """Certificate: det J is not positive."""
+    """det J is not positive."""
     ROUND_TRIP = Concern.INEXACT, None, "INEXACT_INVERSE"
-    """Certificate: ψ⁻¹(ψ(y)) is not y."""
+    """ψ⁻¹(ψ(y)) is not y."""
     NOT_FALLING = Concern.INEXACT, None, "FOLDS"
-    """Certificate: the Lyapunov value does not fall."""
+    """The Lyapunov value does not fall."""
     OFF_MOTION = Concern.INEXACT
-    """Certificate: the shown motion is no image of the base motion."""
+    """The shown motion is no image of the base motion."""
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """Mutated files of every kind that is read, always the same ones, and a program that reads what it is given.
 
 The program takes files from its standard input and prints a line of JSON for each: why it was refused (or nothing), the
-processor time of it and of the processes that it starts, in seconds, by how much its memory grew meanwhile, and the
-largest memory that any of those processes has had, in MB. Another exception than the readers' own ends it, as a crash
+processor time of it and of the processes that it starts, in seconds, and by how much its memory grew meanwhile, in MB;
+at the end the largest memory of those processes, in MB. Another exception than the readers' own ends it, as a crash
 does. Reading is apart from the test because memory can only be measured for a whole process.
 """
 
@@ -11,6 +11,7 @@ import copy
 import faulthandler
 import io
 import json
+import os
 import re
 import struct
 import sys
@@ -22,12 +23,15 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+import recorded
 import trimesh
 
 from dt_viz import saving
 from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.avoidance.hand import Avoidance
-from dt_viz.errors import DataError
+from dt_viz.errors import DataError, parsing
+from dt_viz.files import uploads
+from dt_viz.files.recordings import Recordings
 from dt_viz.flows.diffeomorphisms import Integration
 from dt_viz.learning import demonstrations as demos
 from dt_viz.learning.imitation import ImitationSettings, fit
@@ -267,6 +271,23 @@ def saved_motion() -> bytes:
         return path.read_bytes()
 
 
+def recorded_seeds() -> Iterator[tuple[str, str, bytes, tuple[Mutation, ...]]]:
+    """Recorded motions of every kind, as a visitor's and as one's own, and an archive of some."""
+    with TemporaryDirectory() as folder:
+        recorded.good_files(Path(folder))
+        paths = {path.suffix: path for path in sorted(Path(folder).glob("a.*"))}
+        file = io.BytesIO()
+        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+            for suffix in (".csv", ".npy", ".mat"):
+                archive.write(paths[suffix], f"day/take{suffix}")
+        yield "takes", "a.zip", file.getvalue(), (with_changed_members,) * 4
+        for suffix, path in paths.items():
+            if suffix not in (".tsv", ".txt", ".dat", ".h5"):  # read as others are
+                own = (with_changed_members,) * 4 if suffix == ".npz" else ()
+                for kind in ("takes", "demonstrations")[: 1 + (suffix != ".mat")]:  # which may end the program
+                    yield kind, path.name, path.read_bytes(), own
+
+
 @cache
 def seeds() -> tuple[tuple[str, str, bytes, tuple[Mutation, ...]], ...]:
     """For each loader whose files are read how: its kind, a name, a good file, and mutations of such files only."""
@@ -303,6 +324,7 @@ def seeds() -> tuple[tuple[str, str, bytes, tuple[Mutation, ...]], ...]:
         ("cloud", "b.npz", npz(points=points[labels].astype(np.float32)), (with_changed_members,) * 4),
         ("cloud", "a.csv", "\n".join(table).encode(), ()),
         ("cloud", "a.ply", "\n".join(cloud).encode(), ()),
+        *recorded_seeds(),
         ("motion", "a.npz", saved_motion(), (*(with_changed_members,) * 4, *(with_changed_text,) * 20)),
     )
 
@@ -323,14 +345,19 @@ def hostile_file(number: int) -> tuple[str, str, bytes]:
 def read(kind: str, name: str, content: bytes) -> None:
     """Read a file and look whether what it gives can be used."""
     if kind == "demonstrations":
-        for demonstration in demos.read_demonstrations(content, name):
+        for demonstration in demos.read_demonstrations(content, name, arm=recorded.Planar()):
             assert np.isfinite(demonstration.positions).all()
             assert (np.diff(demonstration.times) > 0).all()
+        return
+    if kind == "takes":
+        with parsing(DataError, name, "file", "recorded motions"):
+            given = uploads.read_upload(Recordings, [(name, content)], answers={}, joint_names=["joint1", "joint2"])
+        assert all(np.isfinite(take.values).all() and np.isfinite(take.times).all() for take in given.takes)
         return
     if kind == "motion":
         saving.read_motion(content, name)
         return
-    solid = shapes.read_mesh(content, name).solid if kind == "mesh" else shapes.read_cloud(content, name).cloud.solid
+    solid = shapes.read_mesh(content, name)[0] if kind == "mesh" else shapes.read_cloud(content, name)[0].solid
     assert solid.distances.depth > 0
     assert np.isfinite(solid.distances.values).all()
 
@@ -360,8 +387,11 @@ def main() -> None:
 
     unit_map(Sphere(ORIGIN, 2.0)).logit(np.zeros((1, 3)))  # compiling is not reading
     resource.setrlimit(resource.RLIMIT_AS, (MAX_ADDRESS_SPACE, MAX_ADDRESS_SPACE))
+    uploads.keep_ready(main)
     with coarsely() if "--coarse" in sys.argv else nullcontext():
         read_what_is_given()
+    uploads.let_go(main)
+    print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024, flush=True)
 
 
 def read_what_is_given() -> None:
@@ -369,7 +399,11 @@ def read_what_is_given() -> None:
 
     def seconds() -> float:
         both = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-        return sum(used.ru_utime + used.ru_stime for used in both)
+        ready = uploads._ready._process
+        ticks = [0] if ready is None else PROCESS.with_name(f"{ready._process.pid}").joinpath("stat").read_text()
+        ticks = ticks.rpartition(")")[2].split()[11:15] if isinstance(ticks, str) else ticks
+        waiting = sum(map(int, ticks)) / os.sysconf("SC_CLK_TCK")  # of the process that reads, which goes on
+        return sum(used.ru_utime + used.ru_stime for used in both) + waiting
 
     def megabytes(name: str) -> float:
         (kilobytes,) = re.findall(rf"{name}:\s+(\d+) kB", PROCESS.joinpath("status").read_text())
@@ -387,8 +421,7 @@ def read_what_is_given() -> None:
         except DataError as error:
             message = str(error)
         faulthandler.cancel_dump_traceback_later()  # waiting for the next file is no reading
-        worker = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
-        print(json.dumps([message, seconds() - start, megabytes("VmHWM") - before, worker]), flush=True)
+        print(json.dumps([message, seconds() - start, megabytes("VmHWM") - before]), flush=True)
 
 
 if __name__ == "__main__":

@@ -84,15 +84,15 @@ class FrameWithoutMotion(Frame):
     reason: Any = ""
     labels: Any = ()
     learned_steps: Any = ()
-    durations: Any = ()
-    chosen_values: Any = ()
-    arm_duration: Any = None
+    durations: Any = None
+    chosen_values: Any = None
 
 
 def frame_of(scenario: Scenario, **changes: Any) -> Frame:
     """The last frame of a scenario, with nothing in it but what is given."""
     nothing: Any = None
-    given = {"stage": Stage.CERTIFIED, "certificates": Certificates(0.01)} | changes
+    known = {"stage": Stage.CERTIFIED, "certificates": Certificates(0.01), "durations": {}, "chosen_values": {}}
+    given = known | changes
     given.setdefault("shaping", np.ones(len(changes.get("rollouts", ())), bool))
     return FrameWithoutMotion(scenario, motion=nothing, drawn=nothing, **given)
 
@@ -132,7 +132,7 @@ def panel_of(server: viser.ViserServer, notify: Any = ignored) -> ControlPanel:
 class NoFrames:
     """An engine that has no frames: nothing here is about motions."""
 
-    bring, adopt = Engine.bring, Engine.adopt
+    bring = Engine.bring
 
     def __init__(self, robot=None):
         self.follower = Follower(robot or load_jaco())
@@ -147,7 +147,7 @@ class NoFrames:
     def task(self, name):
         return self.own[name][0] if name in self.own else TASKS[name]()
 
-    def frames(self, *_what):
+    def frames(self, *_what: Any) -> Any:
         return iter(())
 
 
@@ -284,8 +284,8 @@ class Bound(Bindings):
         self.edited = Edited(scenario, self)
         self.connect(cast(Session, self.edited))
 
-    def input(self, handle: Any, read: Any, change: Any) -> Control:
-        control = super().input(handle, read, change)
+    def input(self, handle: Any, read: Any, change: Any, **properties: Any) -> Control:
+        control = super().input(handle, read, change, **properties)
         self._inputs.setdefault(handle.label, []).append(SimpleNamespace(control=control, read=read, change=change))
         return control
 

@@ -135,6 +135,7 @@ def test_the_wheel_holds_the_modules_and_the_files_that_they_read_and_nothing_el
     names = zipfile.ZipFile(wheel).namelist()
     assert {name for name in names if ".dist-info/" not in name} == modules | files | {"dt_viz/py.typed"}
     assert any(name.endswith(".dist-info/licenses/LICENSE") for name in names)
+    assert wheel.stat().st_size < 3e6
 
 
 def test_every_module_and_file_is_found_in_the_environment(environment, tmp_path):

@@ -21,9 +21,10 @@ from dt_viz.avoidance import registry
 from dt_viz.avoidance.detour import DetourSettings
 from dt_viz.avoidance.transform import Transform
 from dt_viz.files import npz
+from dt_viz.files.values import packed, unpacked
 from dt_viz.learning.demonstrations import Demonstration
-from dt_viz.obstacles.shapes import SHAPES, MeshObstacle
-from dt_viz.saving import FORMAT, MAX_BYTES, _made, _plain, read_motion
+from dt_viz.obstacles.shapes import SHAPES, MeshObstacle, Obstacle
+from dt_viz.saving import FORMAT, MAX_BYTES, read_motion
 from dt_viz.shipped import ASSETS
 
 FROZEN = Path(__file__).parent / "frozen"
@@ -157,8 +158,9 @@ TRANSFORMS = st.one_of(
 @given(TRANSFORMS)
 def test_equal_transforms_come_back_through_text(transform):
     arrays = {}
-    text = json.dumps(_plain(transform, "it", arrays), allow_nan=False)
-    assert _made(json.loads(text), Transform, "it", arrays) == transform
+    text = json.dumps(packed(transform, "it", arrays), allow_nan=False)
+    classes = {Transform: registry.KINDS, Obstacle: SHAPES}
+    assert unpacked(json.loads(text), Transform, "it", arrays, classes) == transform
 
 
 @pytest.mark.parametrize("name", ["motion_every_transform", "motion_augmented"])

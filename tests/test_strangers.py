@@ -133,6 +133,7 @@ def test_the_examples_are_the_shipped_tasks():
         ((0 * TIMES, PATH), "found 0 s at sample 2, after 0 s; accepted: times that increase"),
         ((TIMES[::-1], PATH), "times that increase"),
         ((TIMES[:50], PATH), "101 positions for 50 times"),
+        ((np.linspace(0, 5000, len(PATH)), PATH), "a duration of .* is it in milliseconds"),
         (dt.Demonstration(cast(Any, None), PATH), "times of 'take 1'"),
         (Table(a=S, b=S), "columns: found a, b; accepted: x, y and perhaps z, t and demo"),
         (Table(x=["a", "b"], y=["c", "d"]), "x, y or z with text"),
@@ -280,11 +281,6 @@ def test_four_coordinates_are_no_place_in_the_plane(drawing):
 def test_a_point_before_the_plane_is_still_said(drawing):
     above = replace(dt.BiasPoint((0.15, 0.05, 0.0)), position=(0.15, 0.05, 0.1))
     assert Kind.OFF_PLANE in {warning.kind for warning in drawing.stack(above).certificates().warnings}
-
-
-def test_milliseconds_are_asked_about():
-    with pytest.raises(dt.DataError, match=r"a duration of .* is it in milliseconds"):
-        dt.fit((np.linspace(0, 5000, len(PATH)), PATH))
 
 
 def test_an_end_stays_where_it_is_unless_ends_are_moved_and_a_goal_may_be_an_array():

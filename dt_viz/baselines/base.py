@@ -1,14 +1,14 @@
 """What a method of the comparison is: it is fitted to a task, and then plans motions around obstacles.
 
-A new method is one file with a subclass of `Method`, and one line in `dt_viz.baselines.registry.METHODS`.
+A new method is one file with a function `fit`, and a row in `dt_viz.baselines.registry.METHODS`.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.util import find_spec
-from typing import ClassVar, Protocol
+from typing import Protocol
 
 from dt_viz.errors import Cancelled, never
 from dt_viz.flows.fields import Array
@@ -58,7 +58,7 @@ class Plan:
 class Planner(Protocol):
     """A method that has been fitted to a task. Any thread may call it."""
 
-    def plan(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
+    def __call__(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
         """Plan motions from the starts (R, 3), metres, around obstacles (an empty union: none).
 
         Methods that plan joints start at the posture of the nearest demonstrated start, moved to the start by inverse
@@ -71,34 +71,30 @@ class Planner(Protocol):
         ...
 
 
-class Method(ABC):
+@dataclass(frozen=True, eq=False)
+class Method:
     """A way to learn motions from demonstrations, or to plan them."""
 
-    name: ClassVar[str]
+    name: str
     """Short name in files and commands."""
-    title: ClassVar[str]
-    promise: ClassVar[str]
+    title: str
+    promise: str
     """Sentence that says what it guarantees and what it does not."""
-    stable: ClassVar[bool]
+    fit: Callable[[Problem], Planner]
+    """Fits it to a task, or loads what was fitted to it. Raises NotFittedError where the demonstrations do not allow
+    it, or what was fitted is of another task or version."""
+    stable: bool = False
     """Whether it is a dynamical system whose motions reach the goal for certain; a path planned once is none."""
-    whole_arm: ClassVar[bool]
+    whole_arm: bool = False
     """Whether the whole arm avoids, not the end effector alone."""
-    live: ClassVar[bool]
+    live: bool = False
     """Whether it follows a drag; others plan when the obstacle rests."""
-    avoids: ClassVar[bool] = True
+    avoids: bool = True
     """Whether its motions depend on the obstacle."""
-    needs: ClassVar[tuple[str, ...]] = ()
+    needs: tuple[str, ...] = ()
     """Modules beyond DT-Viz's own that it cannot plan without."""
 
     @property
     def missing(self) -> tuple[str, ...]:
         """Modules it needs that are not installed; see `INSTALL`."""
         return tuple(module for module in self.needs if find_spec(module) is None)
-
-    @abstractmethod
-    def fit(self, problem: Problem) -> Planner:
-        """Fit the method to a task, or load what was fitted to it.
-
-        Raises:
-            NotFittedError: the demonstrations do not allow it, or what was fitted is of another task or version.
-        """

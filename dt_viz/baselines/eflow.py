@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from dt_viz.baselines.base import Method, Plan, Planner, Problem
-from dt_viz.baselines.weights import FOLDER, check_shapes, load_weights
+from dt_viz.baselines.base import Plan, Planner, Problem
+from dt_viz.baselines.weights import FOLDER, load_weights
 from dt_viz.errors import Cancelled, never
 from dt_viz.flows.diffeomorphisms import Chain, Diffeomorphism, Placed
 from dt_viz.flows.fields import Array, Indices
@@ -192,23 +192,8 @@ class EFlowSystem:
             task: the task that they were trained for.
             arrays: as `dt_viz.baselines.eflow_training.train` returns them.
             precision: numpy type that the cosines are computed in; single costs less than a micrometre.
-
-        Raises:
-            NotFittedError: an array is missing, or of another shape.
         """
-        dim, num_hidden = task.demonstrations[0].dimension, ARCHITECTURE.num_hidden
-        features = (ARCHITECTURE.num_blocks, 2, ARCHITECTURE.num_features)
-        shapes = {
-            "frequencies": (*features, (dim + 1) // 2),
-            "phases": features,
-            "weights": (*features, (dim + 1) // 2),
-            "normalisation": (2, dim),
-            "goal": (dim,),
-            "speed_0": (num_hidden, dim + 1),
-            "speed_1": (num_hidden, num_hidden + 1),
-            "speed_2": (1, num_hidden + 1),
-        }
-        check_shapes("eflow", arrays, shapes)
+        dim = task.demonstrations[0].dimension
         couplings = [
             Coupling.of(a, b, W[..., : num_of(a, dim)], phases, w[..., : num_of(b, dim)])
             for (a, b), W, phases, w in zip(
@@ -230,10 +215,6 @@ class EFlowSystem:
         descent = unit(self.latent_goal - z)
         rate = self.scale * self.speed(self.normalised(y))
         return rate[:, None] * np.linalg.solve(J, descent[..., None])[..., 0]
-
-    def lyapunov(self, y: Array) -> Array:
-        """‖ψ(y) − ψ(y_e)‖ (N,), in the normalised unit."""
-        return np.linalg.norm(self.transform.forward(y) - self.latent_goal, axis=-1) / self.scale
 
     def rollouts(self, starts: Array, spacing: float) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
         """Motions to the goal, exact but for their times, whose integral is a sum of trapezia.
@@ -260,32 +241,20 @@ class EFlowSystem:
         return bundle.paths, tuple(np.append(0.0, np.cumsum(step)) for step in steps)
 
 
-@dataclass(frozen=True, eq=False)
-class _Planner:
-    system: EFlowSystem
-    spacing: float
-
-    def plan(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
-        """Plan without regard to the obstacle; see `Planner`."""
-        return Plan(*self.system.rollouts(starts, self.spacing))
+def load_system(task: Task, folder: Path = FOLDER) -> EFlowSystem:
+    """Load the weights of a task. Raises NotFittedError as `fit`."""
+    return EFlowSystem.of(task, load_weights("eflow", VERSION, task, folder))
 
 
-class EFlow(Method):
-    """EFlow: imitation alone."""
+def fit(problem: Problem, folder: Path = FOLDER) -> Planner:
+    """Load the task's weights; motions are the same around all obstacles.
 
-    name, title = "eflow", "EFlow"
-    promise = "Stable: every motion reaches the goal, by construction. It does not avoid."
-    stable, whole_arm, live = True, False, True
-    avoids = False
+    Raises:
+        NotFittedError: there are none that can be used.
+    """
+    system = load_system(problem.task, folder)
 
-    def __init__(self, spacing: float = LIVE.spacing, folder: Path = FOLDER) -> None:
-        """Choose the largest distance between samples of a path, metres, and the folder of the weights."""
-        self.spacing, self.folder = spacing, folder
+    def plan(obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
+        return Plan(*system.rollouts(starts, LIVE.spacing))
 
-    def fit(self, problem: Problem) -> Planner:
-        """Load the task's weights; see `Method`."""
-        return _Planner(self.system(problem.task), self.spacing)
-
-    def system(self, task: Task) -> EFlowSystem:
-        """Load the task's weights. Raises NotFittedError as `Method.fit`."""
-        return EFlowSystem.of(task, load_weights("eflow", VERSION, task, self.folder))
+    return plan

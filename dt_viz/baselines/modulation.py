@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.integrate import cumulative_trapezoid, solve_ivp
 
-from dt_viz.baselines.base import Method, NotFittedError, Plan, Planner, Problem
+from dt_viz.baselines.base import NotFittedError, Plan, Planner, Problem
 from dt_viz.errors import Cancelled, never
 from dt_viz.flows.fields import Array
 from dt_viz.flows.rollouts import ARRIVED
@@ -53,18 +53,15 @@ def gamma(obstacle: Obstacle, distance: Array) -> Array:
     return (1 + np.maximum(distance, 0) / obstacle.depth) ** 2
 
 
-def modulated(obstacle: Union, y: Array, v: Array) -> tuple[Array, Array]:
-    """Velocities `v` (N, 3), m/s, at `y` (N, 3), metres, as the obstacles modulate them.
+def modulated(obstacle: Union, y: Array, v: Array) -> Array:
+    """Return velocities `v` (N, 3), m/s, at `y` (N, 3), metres, as the obstacles modulate them.
 
     Where a velocity leads away from an obstacle, λ_r is 1 (the tail effect). Several obstacles are weighted by how near
     each is, so that on the surface of one it alone counts.
-
-    Returns:
-        Velocities (N, 3), m/s, and the distances (N,), metres, from the nearest obstacle.
     """
     if not obstacle.parts:
-        return v, np.full(len(y), np.inf)
-    velocities, gammas, distances = [], [], []
+        return v
+    velocities, gammas = [], []
     for part in obstacle.parts:
         distance, n = Union((part,)).distance_and_normal(y)
         r = unit(y - np.array(part.position))
@@ -75,12 +72,11 @@ def modulated(obstacle: Union, y: Array, v: Array) -> tuple[Array, Array]:
         radial = np.where(towards >= 0, 1.0, 1 - near) * along_r
         velocities.append(radial[:, None] * r + (1 + near)[:, None] * tangential)
         gammas.append(near)
-        distances.append(distance)
     far = 1 / np.array(gammas) - 1  # (parts, N), zero on the surface
     weights = np.array([np.prod(np.delete(far, k, axis=0), axis=0) for k in range(len(far))])
     total = weights.sum(axis=0)
     weights = np.where(total > 0, weights / np.where(total > 0, total, 1), 1 / len(far))
-    return np.einsum("pn,pnd->nd", weights, np.array(velocities)), np.min(distances, axis=0)
+    return np.einsum("pn,pnd->nd", weights, np.array(velocities))
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +85,7 @@ class _Planner:
     """Our imitation."""
     settings: ModulationSettings
 
-    def plan(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
+    def __call__(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
         """Plan motions of the end effector; see `Planner`."""
         settings, base, num = self.settings, self.system.base, len(starts)
 
@@ -136,26 +132,15 @@ class _Planner:
         y, D = self.system.transform.inverse_jacobian(z)
         offset = self.system.base.goal - z
         nominal = np.einsum("nij,nj->ni", D, unit(offset))
-        v, _ = modulated(obstacle, y, nominal)
+        v = modulated(obstacle, y, nominal)
         speed = np.linalg.norm(v, axis=1) + self.settings.slowest * np.linalg.norm(nominal, axis=1)
         step = np.tanh(np.linalg.norm(offset, axis=1) / self.settings.approach) / divisor(speed)
         return y, step[:, None] * np.linalg.solve(D, v[..., None])[..., 0], step
 
 
-class Modulation(Method):
-    """Our imitation, its velocity modulated around the obstacles."""
-
-    name, title = "modulation", "Modulation"
-    promise = "The end effector's velocity never leads into a star-shaped obstacle; a motion may stop before one."
-    stable, whole_arm, live = False, False, True
-
-    def __init__(self, settings: ModulationSettings | None = None) -> None:
-        """Choose the settings."""
-        self.settings = settings or ModulationSettings()
-
-    def fit(self, problem: Problem) -> Planner:
-        """Take what is learned already; see `Method`."""
-        system = problem.learned.system
-        if system.transform.dim != problem.task.starts.shape[1]:
-            raise NotFittedError("modulation turns velocities at places; this task is learned in augmented states")
-        return _Planner(system, self.settings)
+def fit(problem: Problem, settings: ModulationSettings | None = None) -> Planner:
+    """Take what is learned already. Raises NotFittedError where that is not a velocity at each place."""
+    system = problem.learned.system
+    if system.transform.dim != problem.task.starts.shape[1]:
+        raise NotFittedError("modulation turns velocities at places; this task is learned in augmented states")
+    return _Planner(system, settings or ModulationSettings())

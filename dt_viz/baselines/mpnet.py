@@ -21,9 +21,9 @@ from pathlib import Path
 
 import numpy as np
 
-from dt_viz.baselines.base import Method, NotFittedError, Plan, Planner, Problem
+from dt_viz.baselines.base import NotFittedError, Plan, Planner, Problem
 from dt_viz.baselines.postures import PlanningScene, Query, planned
-from dt_viz.baselines.weights import FOLDER, check_shapes, load_weights
+from dt_viz.baselines.weights import FOLDER, load_weights
 from dt_viz.errors import Cancelled, end_if, never
 from dt_viz.flows.fields import Array
 from dt_viz.obstacles.union import Union
@@ -63,18 +63,21 @@ ARCHITECTURE = MPNetSettings()
 class Network:
     """Linear layers with parametric rectifiers between them, and dropout after the first of these."""
 
-    weights: tuple[Array, ...]
+    weights: Sequence[Array]
     """Of each layer, (out, in)."""
-    biases: tuple[Array, ...]
+    biases: Sequence[Array]
     slopes: Array
     """Slope of the rectifier after each layer but the last, below zero."""
+    centre: Array
+    """(n,) rad, the postures' place in the network's unit."""
+    scale: Array
+    """(n,) rad for one such unit."""
 
     @classmethod
     def of(cls, arrays: Mapping[str, Array]) -> Network:
-        """Make the network of arrays ``W_k``, ``c_k`` and ``slopes``."""
-        layers = range(len(arrays["slopes"]) + 1)
-        weights, biases = (tuple(arrays[f"{kind}_{k}"] for k in layers) for kind in "Wc")
-        return cls(weights, biases, arrays["slopes"])
+        """Make the network of arrays as `dt_viz.baselines.mpnet_training.train` returns them."""
+        weights, biases = ([arrays[f"{kind}_{k}"] for k in range(len(arrays["slopes"]) + 1)] for kind in "Wc")
+        return cls(weights, biases, arrays["slopes"], arrays["centre"], arrays["scale"])
 
     def masks(self, rng: np.random.Generator, num: int) -> list[Array]:
         """Factors (num, out) for the outputs of the first layers: 0 for neurons that are left out, else 1/(1 − p)."""
@@ -93,44 +96,14 @@ class Network:
                 x = x * masks[k]
         return inputs, sums
 
-
-@dataclass(frozen=True, eq=False)
-class MPNetModel:
-    """Planning network of one task."""
-
-    planning: Network
-    centre: Array
-    """(n,) rad, the postures' place in the network's unit."""
-    scale: Array
-    """(n,) rad for one such unit."""
-
-    @classmethod
-    def of(cls, arrays: Mapping[str, Array], num_joints: int) -> MPNetModel:
-        """Make the network that weights describe, as `dt_viz.baselines.mpnet_training.train` returns them.
-
-        Raises:
-            NotFittedError: an array is missing, or of another shape.
-        """
-        shapes: dict[str, tuple[int, ...]] = {"centre": (num_joints,), "scale": (num_joints,)}
-        for k, (num_in, num_out) in enumerate(pairwise(ARCHITECTURE.widths(num_joints))):
-            shapes |= {f"W_{k}": (num_out, num_in), f"c_{k}": (num_out,)}
-        check_shapes("mpnet", arrays, shapes | {"slopes": (len(ARCHITECTURE.hidden),)})
-        return cls(Network.of(arrays), arrays["centre"], arrays["scale"])
-
     def next(self, q: Array, goal: Array, rng: np.random.Generator) -> Array:
-        """The next posture (n,), rad, on the way from q (n,) to a goal (n,).
-
-        Args:
-            q: posture, rad.
-            goal: posture, rad.
-            rng: draws the neurons that are left out.
-        """
+        """The next posture (n,), rad, on the way from q (n,) to a goal (n,); `rng` draws the neurons left out."""
         x = np.concatenate([(q - self.centre) / self.scale, (goal - self.centre) / self.scale])
-        _, sums = self.planning.traced(x[None], self.planning.masks(rng, 1))
+        _, sums = self.traced(x[None], self.masks(rng, 1))
         return self.centre + self.scale * sums[-1][0]
 
 
-Replan = Callable[[Array, Array], list[Array]]
+Replan = Callable[["Search", Array, Array], list[Array]]
 """Plans a stretch between two postures (n,) again: its postures, both ends among them."""
 
 
@@ -138,7 +111,7 @@ Replan = Callable[[Array, Array], list[Array]]
 class Search:
     """The search for one motion."""
 
-    model: MPNetModel
+    model: Network
     surroundings: PlanningScene
     rng: np.random.Generator
     cancelled: Cancelled = never
@@ -181,20 +154,20 @@ class Search:
         ends = [way[0], *(q for q in way[1:-1] if self.free(q, q)), way[-1]]
         found = [ends[0]]
         for start, end in pairwise(ends):
-            found += [end] if self.free(start, end) else replan(start, end)[1:]
+            found += [end] if self.free(start, end) else replan(self, start, end)[1:]
         return found
 
     def is_free(self, way: list[Array]) -> bool:
         """Decide whether a whole way is free."""
         return all(self.free(*piece) for piece in pairwise(way))
 
-    def way(self, query: Query) -> list[Array]:
-        """Plan a motion; it may collide."""
+    def way(self, query: Query, replan: Replan | None) -> list[Array]:
+        """Plan a motion, in the end by `replan` where that is given; it may collide."""
         way = self.contracted(self.bidirectional(query.start, query.goal))
-        for _ in range(ARCHITECTURE.max_rounds):
+        for again in (*[Search.bidirectional] * ARCHITECTURE.max_rounds, *([replan] if replan else [])):
             if self.is_free(way):
                 break
-            way = self.contracted(self.replanned(way, self.bidirectional))
+            way = self.contracted(self.replanned(way, again))
         return way
 
 
@@ -203,47 +176,35 @@ class MPNetPlanner:
     """MPNet for one task; see `Planner`."""
 
     problem: Problem
-    model: MPNetModel
+    model: Network
+    replan: Replan | None
 
-    def plan(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
+    def __call__(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
         """Plan around an obstacle as far as that succeeds; see `Planner`."""
-        surroundings = PlanningScene.of(self.problem.robot, obstacle)
+        surroundings = PlanningScene(self.problem.robot, obstacle)
         queries, ways, warnings = [], [], []
         for number, start in enumerate(starts):
             query = Query.of(self.problem, start)
             search = Search(self.model, surroundings, np.random.default_rng(ARCHITECTURE.seed), cancelled)
-            way = self.way(search, query)
+            way = search.way(query, self.replan)
             if not search.is_free(way):
                 warnings.append(f"the motion from start {number + 1} collides: no free way was found")
             queries.append(query)
             ways.append(np.stack(way))
         return planned(self.problem, queries, ways, tuple(warnings))
 
-    def way(self, search: Search, query: Query) -> list[Array]:
-        """Plan one motion; it may collide."""
-        return search.way(query)
 
+def fit(problem: Problem, replan: Replan | None = None, folder: Path = FOLDER) -> Planner:
+    """Load the task's network.
 
-class MPNet(Method):
-    """MPNet with neural replanning."""
+    Args:
+        problem: the task.
+        replan: plans again what the network finds no free way for.
+        folder: of the weights.
 
-    name, title = "mpnet", "MPNet"
-    promise = (
-        "A path planned once, which ends at the goal, through the obstacle where no free way is found: trained on "
-        "demonstrations alone, it has seen no obstacle."
-    )
-    stable, whole_arm, live = False, True, False
-
-    def __init__(self, folder: Path = FOLDER) -> None:
-        """Choose the folder of the weights."""
-        self.folder = folder
-
-    def fit(self, problem: Problem) -> Planner:
-        """Load the task's weights; see `Method`."""
-        return MPNetPlanner(problem, self.model(problem))
-
-    def model(self, problem: Problem) -> MPNetModel:
-        """Load the task's network. Raises NotFittedError as `Method.fit`, and for another arm."""
-        if problem.robot.name != TRAINED_FOR:
-            raise NotFittedError(f"trained for the {TRAINED_FOR.upper()} only")
-        return MPNetModel.of(load_weights(MPNet.name, VERSION, problem.task, self.folder), problem.robot.num_joints)
+    Raises:
+        NotFittedError: there are no weights that can be used, or it is another arm.
+    """
+    if problem.robot.name != TRAINED_FOR:
+        raise NotFittedError(f"trained for the {TRAINED_FOR.upper()} only")
+    return MPNetPlanner(problem, Network.of(load_weights("mpnet", VERSION, problem.task, folder)), replan)

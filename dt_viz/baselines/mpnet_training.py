@@ -41,20 +41,20 @@ def train(problem: Problem, num_epochs: int, report: Callable[[str], None], seed
         seed: of the initial weights, the dropout and the order of the steps.
 
     Returns:
-        Arrays for `dt_viz.baselines.mpnet.MPNetModel.of`.
+        Arrays for `dt_viz.baselines.mpnet.Network.of`.
 
     Raises:
         NotFittedError: the demonstrations do not move the arm.
     """
     x, y, centre, scale = steps(problem)
     rng = np.random.default_rng(seed)
-    arrays = initial(ARCHITECTURE.widths(problem.robot.num_joints), rng)
+    arrays, unit = initial(ARCHITECTURE.widths(problem.robot.num_joints), rng), {"centre": centre, "scale": scale}
     mean, spread = ({name: np.zeros_like(array) for name, array in arrays.items()} for _ in range(2))
     num_steps = 0
     for epoch in range(num_epochs):
         total = 0.0
         for rows in np.split(rng.permutation(len(x)), range(SETTINGS.batch, len(x), SETTINGS.batch)):
-            loss, slopes = loss_and_gradient(arrays, x[rows], y[rows], rng)
+            loss, slopes = loss_and_gradient(arrays | unit, x[rows], y[rows], rng)
             total += len(rows) * loss / len(x)
             num_steps += 1
             for name, slope in slopes.items():  # Adam (Kingma and Ba, 2015) with its usual rates of decay
@@ -64,7 +64,7 @@ def train(problem: Problem, num_epochs: int, report: Callable[[str], None], seed
                 arrays[name] = arrays[name] - SETTINGS.rate * mean[name] / (1 - 0.9**num_steps) / size
         if (epoch + 1) % 100 == 0:
             report(f"epoch {epoch + 1} of {num_epochs}, loss {total:.3g}")
-    return {**arrays, "centre": centre, "scale": scale}
+    return arrays | unit
 
 
 def steps(problem: Problem) -> tuple[Array, Array, Array, Array]:

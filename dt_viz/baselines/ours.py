@@ -8,7 +8,7 @@ import numpy as np
 
 from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.avoidance.registry import AVOIDANCE
-from dt_viz.baselines.base import Method, Plan, Planner, Problem
+from dt_viz.baselines.base import Plan, Planner, Problem
 from dt_viz.errors import Cancelled, never
 from dt_viz.flows.fields import Array
 from dt_viz.motion.following import Follower
@@ -21,29 +21,16 @@ from dt_viz.robot.retiming import within_velocity_limits
 from dt_viz.scenario.scenario import Layer, Scenario, Start
 
 
-@dataclass(frozen=True, eq=False)
-class _AlonePlanner:
-    learned: Learned
+def fit_alone(problem: Problem) -> Planner:
+    """Take what is learned already; motions are the same around all obstacles."""
 
-    def plan(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
-        """Plan without regard to the obstacle; see `Planner`."""
-        nominal, places = from_starts(self.learned, starts)
+    def plan(obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
+        nominal, places = from_starts(problem.learned, starts)
         bundle = nominal.bundle
         times = bundle.split(nominal.rays.times(bundle.index, bundle.fraction))
         return Plan(tuple(nominal.paths[place] for place in places), tuple(times[place] for place in places))
 
-
-class OursAlone(Method):
-    """Our imitation alone."""
-
-    name, title = "ours-no-avoidance", "Ours, no avoidance"
-    promise = "Stable: every motion reaches the goal, by construction. It does not avoid."
-    stable, whole_arm, live = True, False, True
-    avoids = False
-
-    def fit(self, problem: Problem) -> Planner:
-        """Take what is learned already; see `Method`."""
-        return _AlonePlanner(problem.learned)
+    return plan
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,23 +39,19 @@ class _WholeArmPlanner:
     follower: Follower
     precision: Precision
 
-    def plan(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
+    def __call__(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
         """Plan motions of the whole arm; those that it finds no way for stay at their start. See `Planner`.
 
         Raises:
             UnreachableError: the arm cannot get to where the task's motions start.
         """
         nominal, places = from_starts(self.learned, starts)
-        moving = self._moving(nominal, obstacle)
-        motions = [moving[place] if place in moving else self._resting(nominal, place) for place in places]
-        end_effector = self.follower.robot.end_effector
-        return Plan(
-            tuple(end_effector(q) for q, _ in motions), tuple(t for _, t in motions), tuple(q for q, _ in motions)
-        )
-
-    def _resting(self, nominal: Nominal, place: int) -> tuple[Array, Array]:
-        """The posture (1, n), rad, at the start of a rollout, at time 0 (1,)."""
-        return self.follower.undisturbed(nominal).tracked.q[place, :1], np.zeros(1)
+        motions = self._moving(nominal, obstacle)
+        if stays := set(places) - set(motions):
+            q = self.follower.undisturbed(nominal).tracked.q
+            motions |= {place: (q[place, :1], np.zeros(1)) for place in stays}
+        joints, times = zip(*(motions[place] for place in places), strict=True)
+        return Plan(tuple(map(self.follower.robot.end_effector, joints)), times, joints)
 
     def _moving(self, nominal: Nominal, obstacle: Union) -> dict[int, tuple[Array, Array]]:
         """Joints (N, n), rad, and times (N,), s, of the rollouts that the arm finds a way for, by their place."""
@@ -81,27 +64,16 @@ class _WholeArmPlanner:
         arm = solved.arm
         if solved.blocked or arm is None:
             return {}
-        due, limits = solved.stack.rays.times(arm.index, arm.fraction), self.follower.robot.velocity_limits
-        rows = {place: arm.index == place for place in np.flatnonzero(solved.nominal.moving).tolist()}
-        return {
-            place: (arm.p[row], within_velocity_limits(due[row], arm.p[row], limits)) for place, row in rows.items()
-        }
+        due, limits, motions = solved.stack.rays.times(arm.index, arm.fraction), self.follower.robot.velocity_limits, {}
+        for place in np.flatnonzero(solved.nominal.moving).tolist():
+            q = arm.p[arm.index == place]
+            motions[place] = q, within_velocity_limits(due[arm.index == place], q, limits)
+        return motions
 
 
-class Ours(Method):
-    """Our imitation, the whole arm led around the obstacles in configuration space."""
-
-    name, title = "ours", "Ours"
-    promise = "Stable, and the whole arm keeps clear; where it finds no way it says so."
-    stable, whole_arm, live = True, True, False
-
-    def __init__(self, precision: Precision = FINE) -> None:
-        """Choose how exactly the motion is worked out."""
-        self.precision = precision
-
-    def fit(self, problem: Problem) -> Planner:
-        """Take what is learned already; see `Method`."""
-        return _WholeArmPlanner(problem.learned, Follower(problem.robot), self.precision)
+def fit(problem: Problem, precision: Precision = FINE) -> Planner:
+    """Take what is learned already; the whole arm is led around the obstacles in configuration space."""
+    return _WholeArmPlanner(problem.learned, Follower(problem.robot), precision)
 
 
 def from_starts(learned: Learned, starts: Array) -> tuple[Nominal, list[int]]:

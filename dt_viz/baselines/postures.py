@@ -11,8 +11,6 @@ from dt_viz.baselines.base import Plan, Problem
 from dt_viz.flows.fields import Array
 from dt_viz.metrics import arc_length, interpolate
 from dt_viz.obstacles.union import Union
-from dt_viz.robot.body_points import BodyPoints
-from dt_viz.robot.collision import CollisionModel
 from dt_viz.robot.inverse_kinematics import inverse_kinematics
 from dt_viz.robot.retiming import within_velocity_limits
 from dt_viz.robot.robot import Robot
@@ -53,39 +51,32 @@ class PlanningScene:
 
     robot: Robot
     obstacle: Union
-    body: BodyPoints
-    model: CollisionModel
-
-    @classmethod
-    def of(cls, robot: Robot, obstacle: Union) -> PlanningScene:
-        """The surroundings of an arm with an obstacle."""
-        return cls(robot, obstacle, robot.links, robot.collision)
 
     def is_free(self, start: Array, end: Array) -> bool:
         """Decide whether the arm is free on the straight line between two postures (n,), rad, at every point of it."""
         turn = np.abs(end - start)
-        num = 1 + int(np.ceil((self.model.reach * turn).sum(axis=1).max() / SPACING))
+        num = 1 + int(np.ceil((self.robot.collision.reach * turn).sum(axis=1).max() / SPACING))
         line = start + np.linspace(0, 1, num + 1)[:, None] * (end - start)
         # spheres that cover the links answer most questions
         if self.obstacle.parts and not self._clears(line):
             return False
-        height = self.body.positions(self.robot, line)[..., 2] - self.body.radius
-        if height.min() <= SPACING / 2 and self.model.nearest_to_table(line[[0, -1]]).distance <= 0:
+        height = self.robot.links.positions(self.robot, line)[..., 2] - self.robot.links.radius
+        if height.min() <= SPACING / 2 and self.robot.collision.nearest_to_table(line[[0, -1]]).distance <= 0:
             return False
-        itself = self.model.nearest_to_itself(line[[0, -1]])
+        itself = self.robot.collision.nearest_to_itself(line[[0, -1]])
         return itself is None or itself.distance > 0
 
     def _clears(self, line: Array) -> bool:
         """Decide whether the arm clears the obstacle, from samples (N, n), rad."""
         if (self.obstacle.signed_distance(self.robot.end_effector(line)) < 0).any():
             return False
-        room = self.body.clearance(self.robot, line, self.obstacle)
+        room = self.robot.links.clearance(self.robot, line, self.obstacle)
         if room.min() > SPACING / 2:
             return True
         deepest = line[np.argsort(room)[:3]]  # tried before the whole line
-        if any((self.model.obstacle_distance(deepest, part)[0] <= 0).any() for part in self.obstacle.parts):
+        if any((self.robot.collision.obstacle_distance(deepest, part)[0] <= 0).any() for part in self.obstacle.parts):
             return False
-        return self.model.nearest_to_obstacle(line[[0, -1]], self.obstacle).distance > 0
+        return self.robot.collision.nearest_to_obstacle(line[[0, -1]], self.obstacle).distance > 0
 
 
 def planned(problem: Problem, queries: Sequence[Query], ways: Sequence[Array], warnings: tuple[str, ...] = ()) -> Plan:

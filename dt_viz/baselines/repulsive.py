@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from dt_viz.baselines.base import Method, Plan, Planner, Problem
-from dt_viz.baselines.eflow import EFlow, EFlowSystem
+from dt_viz.baselines.base import Plan, Planner, Problem
+from dt_viz.baselines.eflow import EFlowSystem, load_system
 from dt_viz.baselines.weights import FOLDER
 from dt_viz.errors import Cancelled, end_if, never
 from dt_viz.flows.fields import Array, Mask
@@ -57,32 +57,41 @@ class RepulsionSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class _Planner:
+class RepulsivePlanner:
+    """EFlow pushed away from obstacles; see `Planner`."""
+
     system: EFlowSystem
     settings: RepulsionSettings
 
-    def plan(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
+    def __call__(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
         """Plan motions of the end effector; see `Planner`."""
-        pieces: list[list[tuple[Array, Array]]] = [[] for _ in starts]
-        rows, y = np.arange(len(starts)), starts
+        motions: dict[int, tuple[Array, Array]] = {}
+
+        def go_on(row: int, path: Array, times: Array) -> None:
+            if row in motions:
+                before, passed = motions[row]
+                path, times = np.concatenate([before, path[1:]]), np.append(passed, passed[-1] + times[1:])
+            motions[row] = path, times
+
+        rows, y = [*range(len(starts))], starts
         for _ in range(self.settings.max_visits):
             entering = []
             for row, path, times in zip(rows, *self.system.rollouts(y, LIVE.spacing), strict=True):
                 inside = obstacle.signed_distance(path) < self.settings.range
                 last = max(int(inside.argmax()) - 1, 0) if inside.any() else len(path) - 1
-                pieces[row].append((path[: last + 1], times[: last + 1]))
+                go_on(row, path[: last + 1], times[: last + 1])
                 entering += [row] if inside.any() else []
             if not entering:
                 break
-            walks, leave = self._stepped(obstacle, np.stack([pieces[row][-1][0][-1] for row in entering]), cancelled)
+            walks, leave = self._stepped(obstacle, np.stack([motions[row][0][-1] for row in entering]), cancelled)
             for row, walk in zip(entering, walks, strict=True):
-                pieces[row].append((walk, np.arange(len(walk)) / self.settings.rate))
-            rows = np.array(entering)[leave]
-            if not len(rows):
+                go_on(row, walk, np.arange(len(walk)) / self.settings.rate)
+            rows = [row for row, leaves in zip(entering, leave, strict=True) if leaves]
+            if not rows:
                 break
-            y = np.stack([pieces[row][-1][0][-1] for row in rows])
-        motions = [_joined(some) for some in pieces]
-        return Plan(tuple(path for path, _ in motions), tuple(times for _, times in motions))
+            y = np.stack([motions[row][0][-1] for row in rows])
+        paths, times = zip(*(motions[row] for row in range(len(starts))), strict=True)
+        return Plan(paths, times)
 
     def _stepped(self, obstacle: Union, y: Array, cancelled: Cancelled) -> tuple[list[Array], Mask]:
         """Step motions from `y` (N, 3) while they are within the range: paths (N_i, 3), and which leave it (N,)."""
@@ -106,25 +115,6 @@ class _Planner:
         return [path[:length] for path, length in zip(np.stack(places, axis=1), lengths, strict=True)], leave
 
 
-def _joined(pieces: list[tuple[Array, Array]]) -> tuple[Array, Array]:
-    """Join pieces of a motion, each of which begins where and when the one before ends."""
-    path, times = pieces[0]
-    for further, later in pieces[1:]:
-        path, times = np.concatenate([path, further[1:]]), np.concatenate([times, times[-1] + later[1:]])
-    return path, times
-
-
-class EFlowRepulsive(Method):
-    """EFlow with a repulsive potential."""
-
-    name, title = "eflow-repulsive", "EFlow (repulsive)"
-    promise = "No guarantee: it may stop in a local minimum, and a step may end inside the obstacle."
-    stable, whole_arm, live = False, False, True
-
-    def __init__(self, settings: RepulsionSettings | None = None, folder: Path = FOLDER) -> None:
-        """Choose the settings, and the folder of the weights."""
-        self.settings, self.folder = settings or RepulsionSettings(), folder
-
-    def fit(self, problem: Problem) -> Planner:
-        """Load the task's weights; see `Method`."""
-        return _Planner(EFlow(folder=self.folder).system(problem.task), self.settings)
+def fit(problem: Problem, settings: RepulsionSettings | None = None, folder: Path = FOLDER) -> Planner:
+    """Load EFlow's weights for the task. Raises NotFittedError where there are none that can be used."""
+    return RepulsivePlanner(load_system(problem.task, folder), settings or RepulsionSettings())

@@ -14,7 +14,7 @@ from dt_viz.control.settings import ControllerSettings
 from dt_viz.flows.fields import Array
 from dt_viz.flows.rollouts import ARRIVED, Rays, evenly_sampled
 from dt_viz.flows.systems import DiffeomorphicSystem
-from dt_viz.learning.poses import Poses
+from dt_viz.learning.augmented import AugmentedImitation
 from dt_viz.robot.inverse_kinematics import track
 from dt_viz.robot.retiming import within_velocity_limits
 from dt_viz.robot.robot import Robot
@@ -113,7 +113,7 @@ def towards(
     state: Array,
     settings: ControllerSettings,
     z: Array | None = None,
-    poses: Poses | None = None,
+    poses: AugmentedImitation | None = None,
 ) -> Course:
     """Make the motion of a system that a robot follows on a section, onto which it converges.
 

@@ -18,19 +18,15 @@ FORMER: Mapping[str, tuple[str, ...]] = {
     "hand": ("around", "--space", "task"),
 }
 """Former names of commands, and the arguments that they stand for."""
-BENCHMARKS: Mapping[str, str] = {
-    **{name: name for name in ("drag", "latency", "pictures", "scenes")},
-    **dict.fromkeys(("rollouts", "starts", "velocity"), "exactness"),
-}
-"""Former commands that are for developers, and their names in a checkout."""
+MOVED = ("drag", "latency", "pictures", "scenes", "rollouts", "starts", "velocity")
+"""Former commands that are for developers now."""
 
 
 def main(arguments: Sequence[str] | None = None, prog: str = "python -m dt_viz.evaluate") -> int:
     """Run one command; returns the process' exit status, or raises SystemExit where argparse does."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    if given and given[0] in BENCHMARKS:
-        name = BENCHMARKS[given[0]]
-        print(f"{prog}: {given[0]} is now, in a checkout: python -m tests.benchmarks {name}", file=sys.stderr)
+    if given and given[0] in MOVED:
+        print(f"{prog}: {given[0]} is now, in a checkout: python -m tests.benchmarks", file=sys.stderr)
         return BAD_INPUT
     if given and given[0] in FORMER:
         stands_for = FORMER[given[0]]
@@ -44,17 +40,18 @@ def run_command(package: str, commands: Sequence[str], arguments: Sequence[str],
 
     Args:
         package: full name of the package.
-        commands: names of its modules, each with `add_arguments` and `run`, and a summary in its docstring.
+        commands: names of its modules, each with `add_arguments`, `run`, a summary in its docstring, and in `OUT` what
+            `--out` has to be, see `ready_to_write`; without that it has no such option, or one of its own.
         arguments: name and options of the command.
         prog: name of the program in messages.
     """
     # numerical libraries read these when they are first imported; one thread is how the figures compare
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
-    from dt_viz.errors import DataError  # noqa: PLC0415
+    from dt_viz.errors import DataError, FormatError  # noqa: PLC0415
     from dt_viz.evaluate.options import (  # noqa: PLC0415
         PRINTED,
-        InputError,
+        TABLES,
         ready_to_write,
         with_negative_values,
         write_tables,
@@ -68,17 +65,23 @@ def run_command(package: str, commands: Sequence[str], arguments: Sequence[str],
         summary = (module.__doc__ or "").splitlines()[0]
         subparser = subparsers.add_parser(name, help=summary, description=summary)
         module.add_arguments(subparser)
-        subparser.add_argument("--tables", type=Path, metavar="FILE.json", help="also write what is printed in tables")
-        subparser.set_defaults(run=module.run)
+        out = getattr(module, "OUT", None)
+        if out is not None and out != TABLES:
+            subparser.add_argument("--out", type=Path, required=True, metavar=out, help="what is written")
+        names = ("--tables",) if out != TABLES else ("--out", "--tables")
+        subparser.add_argument(*names, type=Path, dest="tables", metavar="FILE.json", help="also write what is printed")
+        subparser.set_defaults(run=module.run, form=out)
     options = parser.parse_args(with_negative_values(arguments))
     PRINTED.clear()
     try:
-        tables = None if options.tables is None else ready_to_write(options.tables, ".json")
+        if options.form not in (None, TABLES):
+            ready_to_write(options.out, options.form)
+        tables = None if options.tables is None else ready_to_write(options.tables, "FILE.json")
         status = options.run(options)
         if tables is not None:
             write_tables(tables)
         return status
-    except (DataError, ImitationError, InputError) as error:
+    except (DataError, ImitationError, FormatError) as error:
         print(f"{prog} {options.command}: {error}", file=sys.stderr)
         return BAD_INPUT
 

@@ -22,7 +22,6 @@ import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -35,7 +34,6 @@ from dt_viz.evaluate.options import (
     avoiding,
     interval,
     new_engine,
-    ready_to_write,
     report,
     whole_number,
     write_npz,
@@ -56,6 +54,7 @@ from dt_viz.scenario.tasks import TASKS, Task
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Stage
 
+OUT = "FILE.npz"
 SPREAD = 0.05
 """Largest distance of a ball's middle from the point that it is put at, metres, for an arm as large as the JACO."""
 NUM_FRAMES = 40
@@ -105,12 +104,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     size = "range of their diameters in metres, for an arm as large as the JACO (default: 0.06,0.16)"
     parser.add_argument("--size", type=interval(1e-3, 1), default=(0.06, 0.16), metavar="LOW[,HIGH]", help=size)
     parser.add_argument("--first-load", action="store_true", help="also load each arm with an empty cache")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE.npz")
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the command."""
-    out, jaco = ready_to_write(options.out, ".npz"), new_engine(TASKS)
+    jaco = new_engine(TASKS)
     engines = {arm: new_engine(TASKS, arm) for arm in options.arm}
     rows, arrays = [], {}
     for arm, engine in engines.items():
@@ -126,7 +124,7 @@ def run(options: argparse.Namespace) -> int:
         for field in fields(Passage):
             values = [getattr(passage, field.name) for passage in passages]
             arrays[f"{arm}_{field.name}"] = np.array([-1 if value is None else value for value in values])
-        write_npz(out, **arrays)
+        write_npz(options.out, **arrays)
     report(rows, markdown=True)
     return 0
 
@@ -169,7 +167,7 @@ def _passages(engine: Engine, options: argparse.Namespace) -> Iterator[Passage]:
         ball, postures, again = _passable_ball(engine, task, rng, options.size)
         avoidance = ArmAvoidance(ball)
         place = measured(engine, task, avoidance)
-        values = (*ball.position, ball.radius), again, len(place.ends) - 1, len(place.rollouts)
+        values = (*ball.position, ball.radius), again, len(place.ends) - 1, len(place.motions)
         passage = Passage(task.name, *values, avoidance.margin - place.clearance, place.clearance)
         if place.motions:
             joints, goal = _in_the_loop(engine, avoiding(task, avoidance), int(rng.choice([*place.motions])))

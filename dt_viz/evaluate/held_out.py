@@ -24,7 +24,6 @@ from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.augmented import AugmentedImitation
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.interface import AnyImitation
-from dt_viz.learning.poses import Poses
 from dt_viz.metrics import arc_length, discrete_frechet, resample_by_arc_length, rms_at_equal_times
 
 WAYS = ("learned", "mean", "nearest")
@@ -42,22 +41,19 @@ class Followed:
     demonstration: Demonstration
     state: str
     """State in which the motion that follows it was learned."""
-    paths: Mapping[str, Array]
-    """(T, d), metres, of each of `WAYS`."""
-    times: Mapping[str, Array]
-    """(T,), seconds."""
+    motions: Mapping[str, tuple[Array, Array]]
+    """Path (T, d), metres, and times (T,), seconds, of each of `WAYS`."""
     degrees: Mapping[str, Array]
     """Of "learned" and "mean", see `degrees_off`; empty without orientations."""
 
     def frechet(self, way: str) -> float:
         """Discrete Fréchet distance from the demonstration, metres."""
-        return float(frechet([self.paths[way]], [self.demonstration.positions])[0])
+        return float(frechet([self.motions[way][0]], [self.demonstration.positions])[0])
 
     def rms(self, way: str) -> float:
         """Root mean square distance at equal times, metres."""
-        demonstrated = self.demonstration
-        times = demonstrated.times - demonstrated.times[0]
-        return rms_at_equal_times(self.times[way], self.paths[way], times, demonstrated.positions)
+        (path, times), demonstrated = self.motions[way], self.demonstration
+        return rms_at_equal_times(times, path, demonstrated.times - demonstrated.times[0], demonstrated.positions)
 
 
 def follow(demonstrations: Sequence[Demonstration], learn: Learn, folds: int) -> list[Followed]:
@@ -81,20 +77,13 @@ def follow(demonstrations: Sequence[Demonstration], learn: Learn, folds: int) ->
             start = demonstrations[i].positions[0]
             nearest = int(np.linalg.norm(paths[:, 0] - start, axis=1).argmin())
             (rollout,), (times,) = rollouts_from(imitation, start[None])
-            mean = paths.mean(axis=0), progress.mean(axis=0), float(np.mean(durations))
-            ways = (
-                (rollout, times),
-                _shifted(start, *mean),
-                _shifted(start, paths[nearest], progress[nearest], durations[nearest]),
-            )
-            by_way = dict(zip(WAYS, ways, strict=True))
-            followed[i] = Followed(
-                demonstrations[i],
-                imitation.state,
-                {way: path for way, (path, _) in by_way.items()},
-                {way: times for way, (_, times) in by_way.items()},
-                degrees_off(imitation, others, demonstrations[i]),
-            )
+            motions = {
+                "learned": (rollout, times),
+                "mean": _shifted(start, paths.mean(axis=0), progress.mean(axis=0), float(np.mean(durations))),
+                "nearest": _shifted(start, paths[nearest], progress[nearest], durations[nearest]),
+            }
+            degrees = degrees_off(imitation, others, demonstrations[i])
+            followed[i] = Followed(demonstrations[i], imitation.state, motions, degrees)
     return [followed[i] for i in range(len(demonstrations))]
 
 
@@ -118,10 +107,10 @@ def degrees_off(
     return {way: np.rad2deg(apart(orientations, wanted)) for way, orientations in found.items()}
 
 
-def _turns(poses: Poses, demonstration: Demonstration) -> Array:
+def _turns(poses: AugmentedImitation, demonstration: Demonstration) -> Array:
     """Rotation vectors (`NUM_COMPARED`, 3) of a demonstration, times a radius, evenly along the way of its pose."""
-    assert demonstration.orientations is not None
-    vectors = poses.imitation.radius * logarithm(poses.goal_orientation, demonstration.orientations)
+    assert demonstration.orientations is not None and poses.goal_orientation is not None
+    vectors = poses.radius * logarithm(poses.goal_orientation, demonstration.orientations)
     return resample_by_arc_length(np.hstack([demonstration.positions, vectors]), NUM_COMPARED)[:, 3:]
 
 
@@ -137,34 +126,17 @@ def _progress(demonstration: Demonstration) -> Array:
 
 
 def _shifted(start: Array, path: Array, progress: Array, duration: float) -> tuple[Array, Array]:
-    """A path (T, d), even in its length, shifted to `start` (d,), and its times (T,), seconds.
-
-    Args:
-        start: metres.
-        path: metres.
-        progress: (T,) part of the length that lies behind at even times.
-        duration: seconds.
-    """
+    """A path (T, d), even in its length, shifted to `start` (d,), and its times (T,); `progress` is at even times."""
     even = np.linspace(0, 1, len(path))
     return shifted_to(start, path), duration * np.interp(even, progress, even)
-
-
-def begun(imitation: AnyImitation, start: Array) -> tuple[DiffeomorphicSystem, Array]:
-    """The system of a motion from a start (d,), metres, and the state in which it begins there."""
-    return imitation.system, imitation.system.base.states(start)
-
-
-def path_from(system: DiffeomorphicSystem, state: Array, dim: int, num: int = NUM_COMPARED) -> Array:
-    """Places (num, dim), metres, of the motion from a state to the goal, evenly in base space."""
-    z = system.base.at_fraction(system.transform.forward(state), np.linspace(1, 0, num))
-    return system.transform.inverse(z)[:, :dim]
 
 
 def rollouts_from(imitation: AnyImitation, starts: Array) -> tuple[Array, Array]:
     """Return learned motions (R, T, d) from `starts` (R, d), metres, up to the goal, and their times (R, T), s."""
     rollouts, all_times = [], []
     for start in starts:
-        system, state = begun(imitation, start)
+        system = imitation.system
+        state = system.base.states(start)
         (end,) = arrival_times(system, system.transform.forward(state)[None])
         times = end * np.linspace(0.0, 1.0, 1000)
         rollouts.append(system.rollout(state, times)[:, : len(start)])

@@ -28,7 +28,7 @@ import argparse
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from statistics import geometric_mean
@@ -36,19 +36,11 @@ from typing import Any
 
 import numpy as np
 
+from dt_viz.errors import FormatError
 from dt_viz.evaluate import figures
 from dt_viz.evaluate.figures import FigurePanel
-from dt_viz.evaluate.held_out import (
-    WAYS,
-    Followed,
-    Learn,
-    begun,
-    degrees_off,
-    follow,
-    frechet,
-    rollouts_from,
-)
-from dt_viz.evaluate.options import InputError, ready_folder, report, whole_number, write_json, write_npz
+from dt_viz.evaluate.held_out import WAYS, Followed, Learn, degrees_off, follow, frechet, rollouts_from
+from dt_viz.evaluate.options import FOLDER, report, whole_number, write_json, write_npz
 from dt_viz.files.archives import LASA_UNITS
 from dt_viz.flows.diffeomorphisms import min_det_jacobian, round_trip_error
 from dt_viz.flows.fields import Array
@@ -58,6 +50,7 @@ from dt_viz.learning.interface import AnyImitation
 from dt_viz.learning.state import learn as learn_in_state
 from dt_viz.metrics import rms_at_equal_times
 
+OUT = FOLDER
 STATES = ("plain", "augmented", "auto")
 
 
@@ -72,29 +65,14 @@ class Source:
     """Length of one unit of the file, metres."""
 
     @property
+    def paths(self) -> list[Array]:
+        """Each demonstration's places (T_i, d), metres."""
+        return [d.positions for d in self.demonstrations]
+
+    @property
     def extent(self) -> float:
         """Larger side of the demonstrations' box, metres."""
-        return float(np.ptp(np.concatenate([d.positions for d in self.demonstrations]), axis=0).max())
-
-
-@dataclass(frozen=True)
-class ImitationFigures:
-    """Row of the table: distances of a shape's rollouts from the demonstrations they were learned from."""
-
-    name: str
-    demonstrations: int
-    frechet_mean_mm: float
-    frechet_max_mm: float
-    rms_mm: float
-    """Root mean square distance at the demonstration's own times; mean over demonstrations."""
-    fit_seconds: float
-    start_seconds: float
-    """Time until the motion from a new start is known; median over demonstrations."""
-    end_error_mm: float
-    """Largest distance of a rollout's last point from the goal."""
-    round_trip_of_extent: float
-    """Round trip error over the larger side of the demonstrations' box."""
-    min_det_jacobian: float
+        return float(np.ptp(np.concatenate(self.paths), axis=0).max())
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -102,7 +80,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("files", type=Path, nargs="+", metavar="SHAPE", help="file or folder of demonstrations")
     parser.add_argument("--rate", type=float, metavar="HZ", help="samples per second of files without times")
     parser.add_argument("--unit", metavar="UNIT", help="units of the files, such as mm or cm,ms, if not recognised")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for arrays and figures")
     parser.add_argument("--objective", choices=OBJECTIVES, default=OBJECTIVES[0], help="default: %(default)s")
     parser.add_argument("--state", choices=STATES, default=STATES[0], help="default: %(default)s")
     parser.add_argument("--leave-one-out", action="store_true", help="also follow each by what the others teach")
@@ -113,25 +90,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run the command; 2 if one of the shapes could not be fitted."""
     if options.state == "augmented" and options.objective != OBJECTIVES[0]:
-        raise InputError("--objective", options.objective, "none with --state augmented, whose fit has no objective")
+        raise FormatError("--objective", options.objective, "none with --state augmented, whose fit has no objective")
     learn: Learn = partial(learn_in_state, settings=ImitationSettings(options.objective), state=options.state)
     sources = _sources(options.files, options.rate, options.unit)
     holds_out = options.leave_one_out or options.folds is not None
     alone = ", ".join(str(source.path) for source in sources if len(source.demonstrations) == 1)
     if holds_out and alone:
-        raise InputError("--leave-one-out", f"one demonstration only in {alone}", "two or more in each")
-    folder = ready_folder(options.out)
-    rows: list[ImitationFigures] = []
-    panels: list[FigurePanel] = []
+        raise FormatError("--leave-one-out", f"one demonstration only in {alone}", "two or more in each")
+    folder = options.out
+    shapes: list[dict[str, Any]] = []
     held_out: list[dict[str, Any]] = []
-    cases: list[tuple[float, FigurePanel]] = []
     turns: list[dict[str, Any]] = []
+    panels: list[FigurePanel] = []
+    cases: list[tuple[float, FigurePanel]] = []
     for source in sources:
-        name, began = source.path.stem, time.perf_counter()
+        name, began, num = source.path.stem, time.perf_counter(), len(source.demonstrations)
+        folds = min(options.folds or num, num)
         try:
             imitation = learn(source.demonstrations)
             seconds = time.perf_counter() - began
-            followed = follow(source.demonstrations, learn, _num_folds(source, options.folds)) if holds_out else []
+            followed = follow(source.demonstrations, learn, folds) if holds_out else []
         except ImitationError as error:
             print(f"{source.path}: {error}", file=sys.stderr)
             continue
@@ -140,60 +118,50 @@ def run(options: argparse.Namespace) -> int:
         for warning in imitation.warnings:
             print(f"{source.path}: {warning}", file=sys.stderr)
         row, arrays, rollouts = measured(imitation, source, seconds)
-        rows.append(row)
+        shapes.append(row)
         write_npz(folder / f"{name}.npz", **arrays)
-        panels.append(FigurePanel(name, {"demonstration": _paths(source), "learned": rollouts}))
+        panels.append(FigurePanel(name, {"demonstration": source.paths, "learned": rollouts}))
         if imitation.has_orientation:
-            turns.append(turn_row(name, imitation, source, followed))
+            turns.append(turn_row(imitation, source, followed))
         if holds_out:
             write_npz(folder / f"{name}-held-out.npz", **_arrays(followed, source.unit))
-            held_out.append(summed_up(name, _num_folds(source, options.folds), followed))
-            cases += cases_of(name, source, followed)
-    if rows:
-        shapes = [asdict(row) for row in rows]
-        print("in-sample: each rollout against the demonstration that it was learned from")
-        report(_with_means(shapes))
-        print(f"fit, median: {np.median([row.fit_seconds for row in rows]):.2f} s")
-        if holds_out:
-            _report_held_out(held_out)
-        _report_turns(turns)
+            held_out.append(summed_up(name, folds, followed))
+            cases += cases_of(source, followed)
+    if shapes:
+        _report(shapes, held_out, turns)
         chosen = {"state": options.state, "objective": options.objective}
         write_json(folder / "figures.json", {**chosen, "shapes": shapes, "held_out": held_out, "turns": turns})
-        _draw(folder, panels, cases)
-    return 0 if len(rows) == len(sources) else 2
-
-
-def _draw(folder: Path, panels: Sequence[FigurePanel], cases: Sequence[tuple[float, FigurePanel]]) -> None:
-    """Draw all shapes, and the worst cases if there are any, where matplotlib is installed."""
-    if figures.can_draw():
+    if shapes and figures.can_draw():
         figures.save(figures.panels(panels), folder / "shapes.png")
-        if cases:
-            worst = [panel for _, panel in worst_of(cases)]
-            figures.save(figures.panels(worst, columns=3), folder / "worst.png")
+        if worst := worst_of(cases):
+            figures.save(figures.panels([panel for _, panel in worst], columns=3), folder / "worst.png")
+    return 0 if len(shapes) == len(sources) else 2
 
 
-def _report_turns(rows: Sequence[dict[str, Any]]) -> None:
-    """Print the rows of `turn_row`, if there are any."""
-    if rows:
+def _report(shapes: list[dict[str, Any]], held_out: list[dict[str, Any]], turns: list[dict[str, Any]]) -> None:
+    """Print the rows of `measured`, `summed_up` and `turn_row`, and how what was learned fares beside what is not."""
+    print("in-sample: each rollout against the demonstration that it was learned from")
+    report(_with_means(shapes))
+    print(f"fit, median: {np.median([row['fit_seconds'] for row in shapes]):.2f} s")
+    if held_out:
+        print("\nheld out: each demonstration against what was learned from the others")
+        report(_with_means(held_out))
+        better = sum(row["learned_mm"] < min(row["mean_mm"], row["nearest_mm"]) for row in held_out)
+        ratios = [row["of_mean"] for row in held_out]
+        print(f"nearer than both without learning: {better} of {len(held_out)}")
+        print(
+            f"relative to the mean, shifted: {geometric_mean(ratios):.3f} (geometric mean), {max(ratios):.3f} at worst"
+        )
+    if turns:
         print("\nthe hand's orientation, degrees from the demonstration's at equal parts of the way")
-        report(_with_means(rows))
-
-
-def _report_held_out(rows: Sequence[dict[str, Any]]) -> None:
-    """Print the rows of `summed_up`, and how often and how far what was learned is nearer than what takes none."""
-    print("\nheld out: each demonstration against what was learned from the others")
-    report(_with_means(rows))
-    better = sum(row["learned_mm"] < min(row["mean_mm"], row["nearest_mm"]) for row in rows)
-    of_mean = [row["of_mean"] for row in rows]
-    print(f"nearer than both without learning: {better} of {len(rows)}")
-    print(f"relative to the mean, shifted: {geometric_mean(of_mean):.3f} (geometric mean), {max(of_mean):.3f} at worst")
+        report(_with_means(turns))
 
 
 def measured(
     imitation: AnyImitation, source: Source, fit_seconds: float
-) -> tuple[ImitationFigures, dict[str, Any], tuple[Array, ...]]:
+) -> tuple[dict[str, Any], dict[str, Any], tuple[Array, ...]]:
     """Follow all demonstrations; the row of the table, the arrays of the file, and the rollouts (T, d), metres."""
-    paths, unit = _paths(source), source.unit
+    paths, unit = source.paths, source.unit
     rollouts, times = rollouts_from(imitation, np.stack([path[0] for path in paths]))
     distances = 1e3 * frechet(list(rollouts), paths)
     at_times = zip(times, rollouts, source.demonstrations, strict=True)
@@ -201,53 +169,50 @@ def measured(
     grid, transform = _states(imitation, paths), imitation.system.transform
     round_trip, det = round_trip_error(transform, grid), min_det_jacobian(transform.jacobian, grid)
     start_seconds = float(np.median([_seconds_for(imitation, path[0]) for path in paths]))
-    figures = ImitationFigures(
-        name=source.path.stem,
-        demonstrations=len(paths),
-        frechet_mean_mm=float(distances.mean()),
-        frechet_max_mm=float(distances.max()),
-        rms_mm=float(np.mean(rms)),
-        fit_seconds=fit_seconds,
-        start_seconds=start_seconds,
-        end_error_mm=1e3 * float(np.linalg.norm(rollouts[:, -1] - imitation.goal, axis=1).max()),
-        round_trip_of_extent=round_trip / source.extent,
-        min_det_jacobian=det,
-    )
-    arrays: dict[str, Any] = {
+    row = {
+        "name": source.path.stem,
+        "demonstrations": len(paths),
+        "frechet_mean_mm": float(distances.mean()),
+        "frechet_max_mm": float(distances.max()),
+        "rms_mm": float(np.mean(rms)),
+        "fit_seconds": fit_seconds,
+        "start_seconds": start_seconds,
+        "end_error_mm": 1e3 * float(np.linalg.norm(rollouts[:, -1] - imitation.goal, axis=1).max()),
+        "round_trip_of_extent": round_trip / source.extent,
+        "min_det_jacobian": det,
+    }
+    arrays = {
         "fit_seconds": fit_seconds,
         "start_seconds": start_seconds,
         "min_det_jacobian": det,
         "round_trip_error": round_trip / unit,
         "goal": imitation.goal / unit,
+        **{f"rollout_{i}": rollout / unit for i, rollout in enumerate(rollouts)},
+        **{f"times_{i}": moments for i, moments in enumerate(times)},
     }
-    for i, (rollout, t) in enumerate(zip(rollouts, times, strict=True)):
-        arrays |= {f"rollout_{i}": rollout / unit, f"times_{i}": t}
-    return figures, arrays, tuple(rollouts)
+    return row, arrays, tuple(rollouts)
 
 
-def turn_row(
-    name: str, imitation: AnyImitation, source: Source, followed: Sequence[Followed]
-) -> dict[str, float | str]:
+def turn_row(imitation: AnyImitation, source: Source, followed: Sequence[Followed]) -> dict[str, float | str]:
     """Row of the table of orientations: medians and largest angles in-sample, held out, and of the mean of the others.
 
     All over the samples of all demonstrations, degrees.
     """
     demonstrations = source.demonstrations
-    own = np.stack([degrees_off(imitation, demonstrations, each)["learned"] for each in demonstrations])
-    columns = {"in_sample": own}
-    for title, way in (("held_out", "learned"), ("mean_of_others", "mean")):
-        if followed:
-            columns[title] = np.stack([f.degrees[way] for f in followed])
-    figures = {"median": np.median, "largest": np.max}
-    values = {f"{title}_{figure}": float(f(off)) for title, off in columns.items() for figure, f in figures.items()}
-    return {"name": name, **values}
+    angles = {"in_sample": [degrees_off(imitation, demonstrations, each)["learned"] for each in demonstrations]}
+    if followed:
+        angles |= {"held_out": [f.degrees["learned"] for f in followed]}
+        angles |= {"mean_of_others": [f.degrees["mean"] for f in followed]}
+    over = {"median": np.median, "largest": np.max}
+    values = {f"{title}_{name}": float(of(off)) for title, off in angles.items() for name, of in over.items()}
+    return {"name": source.path.stem, **values}
 
 
 def _states(imitation: AnyImitation, paths: Sequence[Array]) -> Array:
     """States (N, d) of the certificates' grid; augmented ones at each of several phases."""
     dim = len(imitation.goal)
     grid = grown_grid(np.concatenate(paths), 101 if dim == 2 else 25)
-    _, begin = begun(imitation, imitation.starts[0])
+    begin = imitation.system.base.states(imitation.starts[0])
     num = 7 if len(begin) > dim else 1
     states = np.tile(begin, (num * len(grid), 1))
     states[:, :dim] = np.tile(grid, (num, 1))
@@ -258,25 +223,18 @@ def _states(imitation: AnyImitation, paths: Sequence[Array]) -> Array:
 def _seconds_for(imitation: AnyImitation, start: Array) -> float:
     """Measure how long the motion from a start (d,) takes to be known, by one that has kept nothing."""
     began = time.perf_counter()
-    system, state = begun(replace(imitation), start)
-    system.base.velocity(system.transform.forward(state))
+    system = replace(imitation).system
+    system.base.velocity(system.transform.forward(system.base.states(start)))
     return time.perf_counter() - began
-
-
-def _num_folds(source: Source, folds: int | None) -> int:
-    num = len(source.demonstrations)
-    return min(folds or num, num)
-
-
-def _paths(source: Source) -> list[Array]:
-    return [d.positions for d in source.demonstrations]
 
 
 def _arrays(followed: Sequence[Followed], unit: float) -> dict[str, Array]:
     """Arrays of the file of what was held out; lengths in so many metres."""
-    paths = {f"{way}_{i}": f.paths[way] / unit for i, f in enumerate(followed) for way in WAYS}
-    paths |= {f"{way}_degrees_{i}": off for i, f in enumerate(followed) for way, off in f.degrees.items()}
-    return paths | {f"{way}_times_{i}": f.times[way] for i, f in enumerate(followed) for way in WAYS}
+    arrays = {f"{way}_degrees_{i}": off for i, f in enumerate(followed) for way, off in f.degrees.items()}
+    for i, f in enumerate(followed):
+        for way, (path, times) in f.motions.items():
+            arrays |= {f"{way}_{i}": path / unit, f"{way}_times_{i}": times}
+    return arrays
 
 
 def summed_up(name: str, folds: int, followed: Sequence[Followed]) -> dict[str, Any]:
@@ -292,19 +250,19 @@ def summed_up(name: str, folds: int, followed: Sequence[Followed]) -> dict[str, 
     return {"name": name, "folds": folds, **distances, "of_mean": of_mean, "plain": plain, **rms}
 
 
-def cases_of(name: str, source: Source, followed: Sequence[Followed]) -> list[tuple[float, FigurePanel]]:
+def cases_of(source: Source, followed: Sequence[Followed]) -> list[tuple[float, FigurePanel]]:
     """The panel of each held-out demonstration, and how far off what was learned is, relative to the extent."""
-    cases, paths = [], _paths(source)
+    cases, paths = [], source.paths
     for i, f in enumerate(followed):
         learned, mean, nearest = (1e3 * f.frechet(way) for way in WAYS)
         kinds = {
-            "learned from": [path for j, path in enumerate(paths) if j != i],
+            "learned from": [*paths[:i], *paths[i + 1 :]],
             "demonstration": [paths[i]],
-            "learned": [f.paths["learned"]],
-            "mean, shifted": [f.paths["mean"]],
-            "nearest start, shifted": [f.paths["nearest"]],
+            "learned": [f.motions["learned"][0]],
+            "mean, shifted": [f.motions["mean"][0]],
+            "nearest start, shifted": [f.motions["nearest"][0]],
         }
-        title = f"{name} {i + 1}  {learned:.1f} mm\nmean {mean:.1f}, nearest {nearest:.1f} mm"
+        title = f"{source.path.stem} {i + 1}  {learned:.1f} mm\nmean {mean:.1f}, nearest {nearest:.1f} mm"
         cases.append((learned / source.extent, FigurePanel(title, kinds)))
     return cases
 
@@ -320,7 +278,7 @@ def _sources(paths: Sequence[Path], rate: float | None, unit: str | None) -> lis
     for path in paths:
         if path.stem in sources:
             found = f"{str(sources[path.stem].path)!r} and {str(path)!r}, which would both become {path.stem}.npz"
-            raise InputError("SHAPE", found, "files of different names")
+            raise FormatError("SHAPE", found, "files of different names")
         size = LASA_UNITS["length"] if path.suffix.lower() == ".mat" else 1.0
         sources[path.stem] = Source(path, load_demonstrations(path, rate=rate, unit=unit), size)
     return list(sources.values())
@@ -330,10 +288,5 @@ def _with_means(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Rows of a table, and below them the mean, smallest and largest of each column of numbers."""
     numbers = {column: [row[column] for row in rows] for column in rows[0] if column != "name"}
     below = {"mean": np.mean, "smallest": np.min, "largest": np.max}
-    return [
-        *rows,
-        *(
-            {"name": name} | {column: float(f(values)) for column, values in numbers.items()}
-            for name, f in below.items()
-        ),
-    ]
+    over = [{"name": name, **{column: float(of(numbers[column])) for column in numbers}} for name, of in below.items()]
+    return [*rows, *over]

@@ -42,8 +42,8 @@ from typing import Any
 
 import numpy as np
 
+from dt_viz.errors import FormatError
 from dt_viz.evaluate.options import (
-    InputError,
     Row,
     add_lasa,
     chosen_task,
@@ -158,7 +158,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run the command; 1 if a visitor had no picture in time, was lost, or was not shown its last edit."""
     _, task = chosen_task(options)
-    out = None if options.out is None else ready_to_write(options.out, ".json")
+    out = None if options.out is None else ready_to_write(options.out, "FILE.json")
     unit = unit_ms()
     print(f"{task.name}; a fixed piece of numpy work takes {unit:.1f} ms")
     visits = []
@@ -195,16 +195,13 @@ async def _visited(
         if None in firsts:
             return figures
         await asyncio.sleep(SETTINGS.settled)
-        visits, num_edits = (
-            [Visit(client) for client in clients],
-            max(1, round(SETTINGS.edits_per_second * options.seconds)),
-        )
-        before, num_before = _processor_seconds(process), sum(client.num_messages for client in clients)
+        visits, num_edits = [*map(Visit, clients)], max(1, round(SETTINGS.edits_per_second * options.seconds))
+        before, num_before = _used(process), sum(client.num_messages for client in clients)
         began = time.perf_counter()
         drags = [() if options.rest else places_of(task, k, num_edits) for k in range(number)]
         measured = (_measured(visit, places, options.seconds) for visit, places in zip(visits, drags, strict=True))
         await asyncio.gather(*measured)
-        elapsed, after = time.perf_counter() - began, _processor_seconds(process)
+        elapsed, after = time.perf_counter() - began, _used(process)
         num_messages = sum(client.num_messages for client in clients) - num_before
         for visit in visits if not options.rest else ():
             with suppress(LostError):
@@ -214,8 +211,8 @@ async def _visited(
             "visitors": [{"lost": visit.lost} if options.rest else visit.figures(seconds) for visit in visits],
             "ping_ms": _spread(np.array([ping for visit in visits for ping in visit.pings])),
             "messages_per_s": num_messages / number / elapsed,
-            "cores": None if before is None or after is None else (after - before) / elapsed,
-            "peak_memory_mb": _peak_memory(process),
+            "cores": None if before is None or after is None else (after[0] - before[0]) / elapsed,
+            "peak_memory_mb": None if after is None else after[1],
         }
 
 
@@ -238,24 +235,24 @@ async def _first_picture(
 
 async def _measured(visit: Visit, places: Sequence[Point], seconds: float) -> None:
     """Have a visitor drag through places, or look on for some seconds if there are none, and ping the server."""
-    pinging = asyncio.create_task(_ping(visit))
+
+    async def ping() -> None:
+        while True:
+            visit.pings.append(await visit.client.ping())
+            await asyncio.sleep(0.25)
+
+    pinging = asyncio.create_task(ping())
     try:
         await (visit.drag(places) if places else asyncio.sleep(seconds))
     except LostError as error:
         visit.lost = str(error)
     pinging.cancel()
-    with suppress(asyncio.CancelledError):
-        await pinging
-
-
-async def _ping(visit: Visit) -> None:
-    """Ping the server again and again; a connection that is lost ends it."""
     try:
-        while True:
-            visit.pings.append(await visit.client.ping())
-            await asyncio.sleep(0.25)
+        await pinging
     except LostError as error:
         visit.lost = str(error)
+    except asyncio.CancelledError:
+        pass
 
 
 @contextmanager
@@ -276,27 +273,21 @@ def _server(options: argparse.Namespace, number: int) -> Iterator[tuple[str, int
             found = (re.search(r"DT-Viz is at http://(\S+)", line) for line in process.stdout)
             address = next((match[1] for match in found if match), None)
             if address is None:
-                raise InputError("--task", "a server that does not start", "one that does: see above")
+                raise FormatError("--task", "a server that does not start", "one that does: see above")
             yield f"ws://{address}", process.pid
         finally:
             process.terminate()
 
 
-def _peak_memory(process: int | None) -> float | None:
-    """The most memory that a process has had, MB; None if it is gone, or the system does not report it."""
-    with suppress(OSError):
-        found = re.search(r"VmHWM:\s*(\d+)", Path(f"/proc/{process}/status").read_text(encoding="ascii"))
-        return None if found is None else int(found[1]) / 1024
-    return None
-
-
-def _processor_seconds(process: int | None) -> float | None:
-    """Processor time that a process has used, seconds; None if it is gone, or the system does not report it."""
+def _used(process: int | None) -> tuple[float, float] | None:
+    """Processor time of a process, s, and its memory at most, MB; None if it is gone or the system does not say."""
     try:
-        fields = Path(f"/proc/{process}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+        fields, status = (Path(f"/proc/{process}/{name}").read_text(encoding="ascii") for name in ("stat", "status"))
     except OSError:
         return None
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    user, system, *_ = map(int, fields.rpartition(")")[2].split()[11:])
+    peak = re.search(r"VmHWM:\s*(\d+)", status)
+    return None if peak is None else ((user + system) / os.sysconf("SC_CLK_TCK"), int(peak[1]) / 1024)
 
 
 def _spread(seconds: Array) -> dict[str, float] | None:

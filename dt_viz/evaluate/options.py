@@ -15,6 +15,7 @@ import numpy as np
 
 from dt_viz.avoidance.hand import Avoidance
 from dt_viz.avoidance.registry import AVOIDANCE
+from dt_viz.errors import FormatError
 from dt_viz.folders import default_cache_folder
 from dt_viz.learning.store import FitStore
 from dt_viz.robot.models import load_arm
@@ -25,15 +26,12 @@ from dt_viz.session.tasks_in_reach import in_reach
 
 Row = Mapping[str, str | float | None]
 """Row of a table: text or number of each column by its header, which names the unit."""
+FOLDER = "DIR"
+"""What a command's `OUT` is where it writes several files."""
+TABLES = "TABLES"
+"""What a command's `OUT` is where it writes nothing but what it prints."""
 PRINTED: list[Sequence[Row]] = []
 """Tables that the running command has printed."""
-
-
-class InputError(ValueError):
-    """A request on the command line that cannot be met."""
-
-    def __init__(self, field: str, found: str, accepted: str) -> None:
-        super().__init__(f"{field}: found {found}; accepted: {accepted}")
 
 
 def add_task(parser: argparse.ArgumentParser) -> None:
@@ -51,13 +49,13 @@ def chosen_task(options: argparse.Namespace) -> tuple[Mapping[str, TaskEntry], T
     """Return all tasks by name, and the chosen one, loaded.
 
     Raises:
-        InputError: there is none of this name.
+        FormatError: there is none of this name.
         DemonstrationError: the folder or the task's file cannot be used.
     """
     tasks = known_tasks(options.lasa)
     if options.task not in tasks:
         hint = "" if options.lasa is not None else "; --lasa DIR adds more"
-        raise InputError("--task", repr(options.task), ", ".join(tasks) + hint)
+        raise FormatError("--task", repr(options.task), ", ".join(tasks) + hint)
     return tasks, tasks[options.task]()
 
 
@@ -96,23 +94,18 @@ def positive_number(unit: str, maximum: float) -> Callable[[str], float]:
 def number(unit: str, minimum: float, maximum: float) -> Callable[[str], float]:
     """Return a type for argparse: a number between two others."""
     least = "more than 0" if minimum == math.ulp(0) else f"at least {minimum:g}"
-
-    def convert(text: str) -> float:
-        (found,) = _numbers(text, (1,), f"{unit}, {least} and at most {maximum:g}", minimum, maximum)
-        return found
-
-    return convert
+    return lambda text: _numbers(text, (1,), f"{unit}, {least} and at most {maximum:g}", minimum, maximum)[0]
 
 
 def interval(minimum: float, maximum: float) -> Callable[[str], tuple[float, float]]:
     """Return a type for argparse: LOW,HIGH within bounds, or one number for both."""
+    accepted = f"a number or LOW,HIGH, at least {minimum:g} and at most {maximum:g}"
 
     def convert(text: str) -> tuple[float, float]:
-        accepted = f"a number or LOW,HIGH, at least {minimum:g} and at most {maximum:g}"
-        found = _numbers(text, (1, 2), accepted, minimum, maximum)
-        if found != sorted(found):
+        low, *_, high = 2 * _numbers(text, (1, 2), accepted, minimum, maximum)
+        if low > high:
             raise argparse.ArgumentTypeError(f"found {text!r}; accepted: {accepted}")
-        return found[0], found[-1]
+        return low, high
 
     return convert
 
@@ -134,31 +127,29 @@ def with_negative_values(arguments: Sequence[str]) -> list[str]:
     return joined
 
 
-def ready_to_write(path: Path, suffix: str) -> Path:
-    """Check, before minutes of measuring, that `--out` can be written; make its folder.
+def ready_to_write(path: Path, form: str) -> Path:
+    """Check, before minutes of measuring, that a file can be written, and make its folder.
+
+    Args:
+        path: the file, or folder.
+        form: `FOLDER`, or "FILE" with the suffix that it has to have.
 
     Raises:
-        InputError: it has another suffix, is a folder, or cannot be written.
+        FormatError: it has another suffix, is a folder where a file is wanted, or cannot be written.
     """
-    if path.suffix.lower() != suffix:
-        raise InputError("--out", repr(str(path)), f"a file that ends in {suffix}")
+    suffix = "" if form == FOLDER else Path(form).suffix
+    if path.suffix.lower() != suffix and form != FOLDER:
+        raise FormatError("--out", repr(str(path)), f"a file that ends in {suffix}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("ab"):
-            pass
+        (path.parent if suffix else path).mkdir(parents=True, exist_ok=True)
+        if suffix and not path.exists():
+            path.touch()
+            path.unlink()
+        elif suffix:
+            path.open("ab").close()
     except OSError as error:
         found = f"{str(path)!r}, which cannot be written ({error.strerror or error})"
-        raise InputError("--out", found, "a file in a folder that can be written to") from error
-    return path
-
-
-def ready_folder(path: Path) -> Path:
-    """Make the folder `--out`. Raises InputError if that is not possible."""
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        found = f"{str(path)!r}, which cannot be made ({error.strerror or error})"
-        raise InputError("--out", found, "a folder, existing or new") from error
+        raise FormatError("--out", found, "a file or folder that can be written") from error
     return path
 
 

@@ -86,7 +86,7 @@ def has_way(
     Returns:
         None where there is no planner: it is an extra.
     """
-    scene = PlanningScene.of(robot, Union((Sphere(ball.position, 2 * (ball.radius + margin)),)))
+    scene = PlanningScene(robot, Union((Sphere(ball.position, 2 * (ball.radius + margin)),)))
     *starts, goal = postures
     try:
         return all(rrt_connect(scene.is_free, robot, start, goal, settings.seconds) for start in starts)

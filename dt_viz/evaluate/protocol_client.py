@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from importlib.metadata import version
 from types import TracebackType
-from typing import Any, TypeVar
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -32,9 +32,6 @@ STATUS = "Smallest det J"
 MAX_MESSAGE = 64 * 2**20
 """Largest size of a message from the server, bytes."""
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
-
-
-T = TypeVar("T", bound="ProtocolClient")
 
 
 class LostError(ConnectionError):
@@ -74,7 +71,7 @@ class ProtocolClient:
         self._news = asyncio.Event()
         self._ended: Exception | None = None
 
-    async def __aenter__(self: T) -> T:
+    async def __aenter__(self) -> ProtocolClient:
         self._socket: ClientConnection = await self._connect()
         self._receiving = asyncio.create_task(self._receive())
         return self
@@ -156,16 +153,18 @@ class ProtocolClient:
     async def grab(self, name: str = OBSTACLE) -> None:
         """Show the handles of the obstacle, and begin to drag a gizmo."""
         await self.set("Handles", True)
-        await self.send("TransformControlsDragStartMessage", name=name, owner=self.nodes[name]["owner"])
+        await self._drag("DragStart", name)
 
     async def move(self, position: ArrayLike, name: str = OBSTACLE) -> None:
         """Drag a gizmo to a place (3,), metres."""
-        pose = {"wxyz": UPRIGHT, "position": np.asarray(position, float).tolist()}
-        await self.send("TransformControlsUpdateMessage", name=name, owner=self.nodes[name]["owner"], **pose)
+        await self._drag("Update", name, wxyz=UPRIGHT, position=np.asarray(position, float).tolist())
 
     async def release(self, name: str = OBSTACLE) -> None:
         """End the drag of a gizmo."""
-        await self.send("TransformControlsDragEndMessage", name=name, owner=self.nodes[name]["owner"])
+        await self._drag("DragEnd", name)
+
+    async def _drag(self, what: str, name: str, **pose: Any) -> None:  # noqa: ANN401 - as the message has them
+        await self.send(f"TransformControls{what}Message", name=name, owner=self.nodes[name]["owner"], **pose)
 
     async def _receive(self) -> None:
         try:

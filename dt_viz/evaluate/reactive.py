@@ -15,10 +15,10 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from itertools import cycle
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,23 +30,22 @@ from dt_viz.control.settings import ControllerSettings
 from dt_viz.evaluate.options import (
     Row,
     add_task,
+    as_text,
     avoiding,
     chosen_task,
     new_engine,
     positive_number,
-    ready_to_write,
     report,
     whole_number,
     write_npz,
 )
 from dt_viz.flows.fields import Array
-from dt_viz.metrics import interpolate, resample_by_arc_length
-from dt_viz.motion.following import Follower
-from dt_viz.motion.solve import Solved
+from dt_viz.metrics import arc_length, interpolate, resample_by_arc_length
 from dt_viz.motion.stack import LIVE
 from dt_viz.obstacles.shapes import UPRIGHT, Box, Obstacle, Quaternion, Sphere, as_point, as_quaternion
-from dt_viz.robot.robot import Robot
 from dt_viz.session.engine import Engine
+
+OUT = "FILE.npz"
 
 
 @dataclass(frozen=True)
@@ -84,33 +83,6 @@ TICK = SETTINGS.tick
 
 
 @dataclass(frozen=True, eq=False)
-class Passage:
-    """An obstacle that passes."""
-
-    path: Array
-    """(N, 3) evenly spaced places of its centre, metres."""
-    comes: float
-    """Time at which it comes, seconds."""
-    length: float
-    """Length of the path, metres."""
-    speed: float
-    """m/s."""
-    wxyz: Quaternion = UPRIGHT
-
-    @property
-    def gone(self) -> float:
-        """Time after which it is not there any more, seconds."""
-        return self.comes + self.length / self.speed
-
-    def at(self, t: float) -> Array:
-        """(3,) its centre, metres; NaN where it is not there."""
-        if not self.comes <= t < self.gone:
-            return np.full(3, np.nan)
-        place = (t - self.comes) * self.speed / self.length * (len(self.path) - 1)
-        return interpolate(np.array([place]), np.arange(len(self.path)), self.path)[0]
-
-
-@dataclass(frozen=True, eq=False)
 class Crossing:
     """Obstacles that cross a motion."""
 
@@ -118,16 +90,13 @@ class Crossing:
     """Rollout that the robot follows."""
     begins: float
     """Time at which the robot sets out, seconds."""
-    passages: tuple[Passage, ...]
+    places: Array
+    """(T, P, 3) centres of the obstacles at each tick until all are gone, metres; NaN for those that are not there."""
+    wxyz: Sequence[Quaternion]
 
-    @property
-    def gone(self) -> float:
-        """Time after which there is no obstacle, seconds."""
-        return max(passage.gone for passage in self.passages)
-
-    def at(self, t: float) -> Array:
+    def at(self, tick: int) -> Array:
         """(P, 3) the centres, metres; NaN for those that are not there."""
-        return np.stack([passage.at(t) for passage in self.passages])
+        return self.places[tick] if tick < len(self.places) else np.full_like(self.places[0], np.nan)
 
 
 @dataclass
@@ -135,9 +104,7 @@ class Run:
     """What happened."""
 
     q: list[Array] = field(default_factory=list)
-    t: list[float] = field(default_factory=list)
-    obstacle: list[Array] = field(default_factory=list)
-    """(P, 3) centres of the obstacles, metres."""
+    """(n,) joint angles at each tick, rad."""
     ticks: list[float] = field(default_factory=list)
     """Processor times of the ticks, seconds."""
     phases: set[Phase] = field(default_factory=set)
@@ -147,32 +114,24 @@ class Bench:
     """A task's robot."""
 
     def __init__(self, engine: Engine, task: str, diameter: float, margin: float, *, boxes: bool = False) -> None:
-        self.diameter, self.margin, self._boxes = diameter, margin, boxes
-        self.follower: Follower = engine.follower
-        self.robot: Robot = engine.follower.robot
-        self._task = engine.task(task)
-        self._solve = lambda scenario: engine.solved(scenario, LIVE)
-        self.scenario = avoiding(self._task, ArmAvoidance((), margin=margin))
-        self.solved: Solved = self._solve(self.scenario)
-        self.section = Section(self.robot, self.follower.reference(self.solved.nominal))
+        self.diameter, self.margin, self.boxes = diameter, margin, boxes
+        self.follower, self.robot = engine.follower, engine.follower.robot
+        self.solved = engine.solved(avoiding(engine.task(task), ArmAvoidance((), margin=margin)), LIVE)
         self.goal = self.solved.nominal.goal
-        self.starts = self.section.postures(self.solved.nominal.starts[:, None])[:, 0]
+        section = Section(self.robot, self.follower.reference(self.solved.nominal))
+        self.starts = section.postures(self.solved.nominal.starts[:, None])[:, 0]
 
     def shape(self, place: Array, wxyz: Quaternion = UPRIGHT) -> Obstacle:
         """The sphere, or box, with its centre at a place (3,), metres."""
-        if self._boxes:
+        if self.boxes:
             a, b, c = (self.diameter * side for side in SETTINGS.box)
             return Box(as_point(place), (a, b, c), wxyz)
         return Sphere(as_point(place), self.diameter)
 
-    def turned(self, rng: np.random.Generator) -> Quaternion:
-        """A random orientation; spheres need none."""
-        return as_quaternion(rng.normal(size=4)) if self._boxes else UPRIGHT
-
-    def obstacles(self, crossing: Crossing, t: float) -> tuple[Obstacle, ...]:
-        """Those that are there at a time."""
-        places = zip(crossing.passages, crossing.at(t), strict=True)
-        return tuple(self.shape(place, passage.wxyz) for passage, place in places if np.isfinite(place[0]))
+    def obstacles(self, crossing: Crossing, tick: int) -> tuple[Obstacle, ...]:
+        """Those that are there at a tick."""
+        places = zip(crossing.at(tick), crossing.wxyz, strict=True)
+        return tuple(self.shape(place, wxyz) for place, wxyz in places if np.isfinite(place[0]))
 
     def undisturbed(self, start: int) -> tuple[Array, Array]:
         """The hand's places (T, 3), metres, and joints (T, n) at all ticks without a sphere."""
@@ -193,25 +152,26 @@ def driven(controller: ArmController, q: Array) -> Array:
 
 def crossings(bench: Bench, speed: float, seed: int, num: int = 1) -> Iterator[tuple[Crossing, float]]:
     """Obstacles that cross, so many at once, and the seconds that the robot takes without them; without an end."""
-    rng, known = np.random.default_rng(seed), {}
+    rng, undisturbed = np.random.default_rng(seed), cache(bench.undisturbed)
     for start in cycle(range(len(bench.starts))):
-        if start not in known:
-            known[start] = bench.undisturbed(start)
-        hand, joints = known[start]
+        hand, joints = undisturbed(start)
         drawn = [_drawn(bench, hand, joints, speed, rng) for _ in range(num)]
-        times = [at * TICK - length / 2 / speed for at, _, length, _ in drawn]
-        begins = max(0.0, *(-time for time in times))
-        passages = (
-            Passage(path, begins + time, length, speed, wxyz)
-            for time, (_, path, length, wxyz) in zip(times, drawn, strict=True)
-        )
-        yield Crossing(start, begins, tuple(passages)), TICK * len(hand)
+        begins = max(0.0, *(-comes for comes, _, _ in drawn))
+        durations = [arc_length(path)[-1] / speed for _, path, _ in drawn]
+        gone = [begins + comes + duration for (comes, *_), duration in zip(drawn, durations, strict=True)]
+        t = TICK * np.arange(np.ceil(max(gone) / TICK))
+        places = np.full((len(t), num, 3), np.nan)
+        for n, (comes, path, _) in enumerate(drawn):
+            there = (begins + comes <= t) & (t < gone[n])
+            passed = (t[there] - begins - comes) / durations[n]
+            places[there, n] = interpolate(passed, np.linspace(0, 1, len(path)), path)
+        yield Crossing(start, begins, places, [wxyz for *_, wxyz in drawn]), TICK * len(hand)
 
 
 def _drawn(
     bench: Bench, hand: Array, joints: Array, speed: float, rng: np.random.Generator
-) -> tuple[int, Array, float, Quaternion]:
-    """Draw an obstacle: the tick at which it is to be at the hand, its path (N, 3), its length, and how it is turned.
+) -> tuple[float, Array, Quaternion]:
+    """Draw an obstacle that will be at the hand: when it comes, s after the robot sets out, its path (N, 3), its turn.
 
     Args:
         bench: its robot.
@@ -225,9 +185,8 @@ def _drawn(
     while True:
         at = int(rng.uniform(0.25, 0.75) * len(hand))
         path = _path(hand[at] + rng.normal(scale=0.02, size=3), rng)
-        wxyz = bench.turned(rng)
-        length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
-        first = bench.shape(path[0], wxyz)
+        first = bench.shape(path[0], as_quaternion(rng.normal(size=4)) if bench.boxes else UPRIGHT)
+        length = float(arc_length(path)[-1])
         room = np.linalg.norm(path[:, None] - pedestal, axis=2) - wall.radius - first.radius
         passing = joints[max(0, at - round(length / 2 / speed / TICK))]
         if (
@@ -235,7 +194,7 @@ def _drawn(
             and room.min() >= SETTINGS.pedestal_room
             and body.clearance(passing[None], first)[0] >= SETTINGS.start_room
         ):
-            return at, path, length, wxyz
+            return at * TICK - length / 2 / speed, path, first.wxyz
 
 
 def _path(middle: Array, rng: np.random.Generator) -> Array:
@@ -255,17 +214,15 @@ def simulated(bench: Bench, crossing: Crossing) -> Run:
     controller.begin(q, crossing.start)
     controller.home(crossing.start)
     looks, went, present = 0.0, False, True
-    for k in range(int((crossing.gone + crossing.begins + SETTINGS.longest) / TICK)):
+    for k in range(len(crossing.places) + int((crossing.begins + SETTINGS.longest) / TICK)):
         t = k * TICK
         run.q.append(q)
-        run.t.append(t)
-        run.obstacle.append(crossing.at(t))
-        if t > crossing.gone and went and not present and controller.phase is Phase.RESTING:
+        if k >= len(crossing.places) and went and not present and controller.phase is Phase.RESTING:
             break
         if not went and t >= crossing.begins:
             controller.go()
             went = True
-        parts = bench.obstacles(crossing, t)
+        parts = bench.obstacles(crossing, k)
         if t >= looks and (parts or present):
             present, looks = bool(parts), t + SETTINGS.look_period
             controller.see(ArmAvoidance(parts, margin=bench.margin))
@@ -278,29 +235,24 @@ def simulated(bench: Bench, crossing: Crossing) -> Run:
 
 def room_at_coming(bench: Bench, run: Run, crossing: Crossing) -> float:
     """Smallest distance of the arm from an obstacle at the tick at which that comes, metres."""
-    body, centres = bench.follower.whole_arm, np.array(run.obstacle)
-    ticks = np.isfinite(centres[:, :, 0]).argmax(axis=0)
-    there = zip(ticks, crossing.passages, strict=True)
-    return min(
-        float(body.clearance(run.q[k][None], bench.shape(centres[k, n], passage.wxyz))[0])
-        for n, (k, passage) in enumerate(there)
-    )
+    ticks = np.isfinite(crossing.places[:, :, 0]).argmax(axis=0)
+    coming = [(run.q[k][None], bench.shape(crossing.places[k, n], crossing.wxyz[n])) for n, k in enumerate(ticks)]
+    return min(float(bench.follower.whole_arm.clearance(q, obstacle)[0]) for q, obstacle in coming)
 
 
 def smallest_distance(bench: Bench, run: Run, crossing: Crossing) -> float:
     """Smallest distance of the arm's meshes from the obstacles, at the ticks and at five places between two, metres."""
     cover, model, best = bench.robot.body, bench.robot.collision, np.inf
-    for passage, centres in zip(crossing.passages, np.array(run.obstacle).transpose(1, 0, 2), strict=True):
+    for wxyz, centres in zip(crossing.wxyz, crossing.places.transpose(1, 0, 2), strict=True):
         (there,) = np.nonzero(np.isfinite(centres[:, 0]))
         finely = np.linspace(there[0], there[-1], 6 * (len(there) - 1) + 1)
         q, places = (interpolate(finely, there, values[there]) for values in (np.array(run.q), centres))
         points = cover.positions(bench.robot, q) - places[:, None]
-        gaps = bench.shape(np.zeros(3), passage.wxyz).signed_distance(points) - cover.radius
-        bounds = gaps.min(axis=1)  # the spheres cover the meshes
-        for k in np.argsort(bounds):
+        bounds = (bench.shape(np.zeros(3), wxyz).signed_distance(points) - cover.radius).min(axis=1)
+        for k in np.argsort(bounds):  # the spheres cover the meshes
             if bounds[k] >= best:
                 break
-            best = min(best, float(model.obstacle_distance(q[[k]], bench.shape(places[k], passage.wxyz))[0][0]))
+            best = min(best, float(model.obstacle_distance(q[[k]], bench.shape(places[k], wxyz))[0][0]))
     return best
 
 
@@ -314,29 +266,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--boxes", action="store_true", help="boxes of D × 0.8 D × 0.6 D, turned, not spheres")
     parser.add_argument("--diameter", type=positive_number("metres", 1), default=0.15, metavar="D", help="metres")
     parser.add_argument("--margin", type=positive_number("metres", 1), default=0.03, metavar="M", help="metres")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE.npz")
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the subcommand."""
     tasks, task = chosen_task(options)
-    out = ready_to_write(options.out, ".npz")
     bench = Bench(new_engine(tasks), task.name, options.diameter, options.margin, boxes=options.boxes)
     arrays: dict[str, Any] = {"diameter": options.diameter}
-    figures: list[RunFigures] = []
+    figures: list[dict[str, Any]] = []
     for crossing, seconds in crossings(bench, options.speed, options.seed, options.obstacles):
         found = simulated(bench, crossing)
         if room_at_coming(bench, found, crossing) < SETTINGS.coming_room:
             continue
-        i, places = len(figures), np.array(found.obstacle)
-        figures.append(RunFigures.of(bench, crossing, found, seconds))
-        arrays |= {f"q_{i}": found.q, f"t_{i}": found.t}
+        i, ticks = len(figures), range(len(found.q))
+        places = np.array([crossing.at(k) for k in ticks])
+        figures.append(figures_of(bench, crossing, found, seconds))
+        arrays |= {f"q_{i}": found.q, f"t_{i}": TICK * np.array(ticks)}
         arrays |= {f"obstacle_{i}": places[:, 0] if options.obstacles == 1 else places}
-        arrays[f"wxyz_{i}"] = [passage.wxyz for passage in crossing.passages]
-        print(i, figures[i], " ".join(sorted(phase.value for phase in found.phases)), flush=True)
+        arrays[f"wxyz_{i}"] = crossing.wxyz
+        values = (f"{name} {as_text(value)}" for name, value in figures[i].items() if name != "ticks")
+        print(i, ", ".join(values), *sorted(phase.value for phase in found.phases), flush=True)
         if len(figures) == options.runs:
             break
-    write_npz(out, **arrays)
+    write_npz(options.out, **arrays)
     shape = "box" if options.boxes else "sphere"
     size = f"{options.obstacles} {shape}(s) of {options.diameter:g} m"
     print(f"\n{task.name}, {size} at {options.speed:g} m/s, margin {options.margin:g} m")
@@ -344,53 +296,31 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-@dataclass(frozen=True)
-class RunFigures:
-    """Measurements of one run."""
-
-    distance: float
-    """Smallest, metres, negative inside."""
-    missed: float
-    """Distance of the hand from the goal at the end, metres."""
-    velocity: float
-    """Largest, in limits."""
-    acceleration: float
-    """Largest, in limits."""
-    lost: float
-    """Time by which it arrived later than without a sphere, seconds."""
-    ticks: Array
-
-    @classmethod
-    def of(cls, bench: Bench, crossing: Crossing, run: Run, seconds: float) -> RunFigures:
-        """Measure a run."""
-        q = np.array(run.q)
-        velocity = np.diff(q, axis=0, prepend=q[:1]) / TICK
-        return cls(
-            smallest_distance(bench, run, crossing),
-            float(np.linalg.norm(bench.robot.end_effector(q[-1]) - bench.goal)),
-            float((np.abs(velocity) / bench.robot.velocity_limits).max()),
-            float(np.abs(np.diff(velocity, axis=0)).max() / TICK / ControllerSettings().acceleration),
-            run.t[-1] - crossing.begins - seconds,
-            np.array(run.ticks),
-        )
-
-    def __str__(self) -> str:
-        return (
-            f"{1e3 * self.distance:.1f} mm, missed {1e3 * self.missed:.2f} mm, limits {self.velocity:.3f} "
-            f"{self.acceleration:.3f}, {self.lost:.1f} s lost;"
-        )
+def figures_of(bench: Bench, crossing: Crossing, run: Run, seconds: float) -> dict[str, Any]:
+    """Measure a run: distances in mm and times in s; velocity and acceleration, at most, relative to the limits."""
+    q = np.array(run.q)
+    velocity = np.diff(q, axis=0, prepend=q[:1]) / TICK
+    return {
+        "clearance": 1e3 * smallest_distance(bench, run, crossing),
+        "missed": 1e3 * float(np.linalg.norm(bench.robot.end_effector(q[-1]) - bench.goal)),
+        "velocity": float((np.abs(velocity) / bench.robot.velocity_limits).max()),
+        "acceleration": float(np.abs(np.diff(velocity, axis=0)).max() / TICK / ControllerSettings().acceleration),
+        "lost": TICK * (len(q) - 1) - crossing.begins - seconds,  # beside the motion without obstacles
+        "ticks": np.array(run.ticks),
+    }
 
 
-def summary(found: Sequence[RunFigures]) -> Row:
+def summary(found: Sequence[Mapping[str, Any]]) -> Row:
     """Row of the table: the figures of all runs; velocity and acceleration relative to the limits."""
-    num, ticks = len(found), 1e3 * np.concatenate([f.ticks for f in found])
+    by_name = {name: [figures[name] for figures in found] for name in found[0]}
+    num, ticks = len(found), 1e3 * np.concatenate(by_name["ticks"])
     return {
         "": "in the loop",
-        "without contact": f"{sum(f.distance > 0 for f in found)} of {num}",
-        "clearance mm": f"{1e3 * min(f.distance for f in found):.1f}",
-        "goal reached": f"{sum(f.missed <= SETTINGS.at_goal for f in found)} of {num}",
-        "velocity": f"{max(f.velocity for f in found):.3f}",
-        "acceleration": f"{max(f.acceleration for f in found):.3f}",
-        "time lost s": f"{np.median([f.lost for f in found]):.1f} ({max(f.lost for f in found):.1f})",
+        "without contact": f"{sum(clearance > 0 for clearance in by_name['clearance'])} of {num}",
+        "clearance mm": f"{min(by_name['clearance']):.1f}",
+        "goal reached": f"{sum(missed <= 1e3 * SETTINGS.at_goal for missed in by_name['missed'])} of {num}",
+        "velocity": f"{max(by_name['velocity']):.3f}",
+        "acceleration": f"{max(by_name['acceleration']):.3f}",
+        "time lost s": f"{np.median(by_name['lost']):.1f} ({max(by_name['lost']):.1f})",
         "tick ms": f"{np.median(ticks):.2f} ({np.percentile(ticks, 95):.1f}, {ticks.max():.0f})",
     }

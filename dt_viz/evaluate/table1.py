@@ -35,22 +35,21 @@ import argparse
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from dt_viz.baselines.base import INSTALL, NotFittedError, Plan, Planner, Problem
 from dt_viz.baselines.registry import METHODS, problem_of
+from dt_viz.errors import FormatError
 from dt_viz.evaluate import figures
-from dt_viz.evaluate.around import TURN_ARC
+from dt_viz.evaluate.around import TURN_ARC, in_ball
 from dt_viz.evaluate.held_out import frechet
 from dt_viz.evaluate.options import (
-    InputError,
+    FOLDER,
     Row,
     new_engine,
-    ready_folder,
     report,
     whole_number,
     write_json,
@@ -67,11 +66,11 @@ from dt_viz.metrics import (
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.inverse_kinematics import UnreachableError, track
-from dt_viz.robot.robot import Robot
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.comparison import curves
 
+OUT = FOLDER
 PAPER_TASKS = ("push_box", "lift_box", "draw_s")
 
 
@@ -96,34 +95,22 @@ SMALLEST = ("clearance", "reached")
 """Columns whose worst value is the smallest."""
 UNITS = {"turn": (1.0, "°"), "reached": (100.0, "%"), "seconds": (1.0, "s"), "jerk": (1.0, "m/s³")}
 """Factor and unit of each column in the printed table; all others are lengths, printed in millimetres."""
-PAPER: Mapping[str, Sequence[tuple[float, float]]] = {
+PAPER: Mapping[str, Sequence[tuple[float | None, float | None]]] = {
     "ours": ((0.124, 0.0), (0.127, 0.0), (0.067, 0.002)),
     "ours-no-avoidance": ((0.070, 0.012), (0.112, 0.012), (0.011, 0.018)),
     "eflow": ((0.068, 0.012), (0.093, 0.152), (0.021, 0.007)),
     "eflow-repulsive": ((0.168, 0.0), (0.252, 0.001), (0.195, 0.003)),
-    "mpnet": ((0.371, 0.038), (0.133, 0.022)),
-    "mpnet-rrt": ((0.371, 0.0), (0.478, 0.0)),
-    "linear": ((0.242, 0.147), (0.205, 0.031)),
+    "mpnet": ((0.371, 0.038), (0.133, 0.022), (None, None)),
+    "mpnet-rrt": ((0.371, 0.0), (0.478, 0.0), (None, None)),
+    "linear": ((0.242, 0.147), (0.205, 0.031), (None, None)),
 }
 """The paper's Table 1: Fréchet and maximum collision distance, metres, by method, for each of `PAPER_TASKS`; it has no
 drawing of the planners."""
 
 
-@dataclass(frozen=True)
-class Measured:
-    """Measurements of one motion; see the columns of the file."""
-
-    frechet: float
-    dtw: float
-    arm_depth: float
-    hand_depth: float
-    clearance: float
-    goal_error: float
-    turn: float
-    jerk: float
-
-
-COLUMNS = (*(value.name for value in fields(Measured)), "reached", "seconds")
+OF_MOTIONS = ("frechet", "dtw", "arm_depth", "hand_depth", "clearance", "goal_error", "turn", "jerk")
+COLUMNS = (*OF_MOTIONS, "reached", "seconds")
+"""Columns of the file, see there: the first are of single motions, the others of all those of a place."""
 
 
 @dataclass(frozen=True)
@@ -147,12 +134,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--count", type=whole_number(1), default=10, help="places (default: %(default)s)")
     parser.add_argument("--perturbed", type=whole_number(0), default=200, help="starts (default: %(default)s)")
     parser.add_argument("--seed", type=whole_number(0), default=0, help="of the places (default: %(default)s)")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the table and its arrays")
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the command; 1 if a method needs what is not installed, or was not trained."""
-    folder, methods = ready_folder(options.out), [METHODS[name] for name in options.methods]
+    folder, methods = options.out, [METHODS[name] for name in options.methods]
     for method in methods:
         if method.missing:
             print(f"{method.title} needs {', '.join(method.missing)}: {INSTALL}; or leave it out", file=sys.stderr)
@@ -190,7 +176,7 @@ def drawn(problem: Problem, count: int, num_perturbed: int, seed: int) -> list[R
     """Draw the places of a task, as the module says, and perturbed starts, divided among the places.
 
     Raises:
-        InputError: the places are not found.
+        FormatError: the places are not found.
     """
     task, model = problem.task, problem.robot.collision
     rng, mean, undisturbed = np.random.default_rng(seed), task.mean_path, problem.learned.demonstrated.paths
@@ -199,7 +185,7 @@ def drawn(problem: Problem, count: int, num_perturbed: int, seed: int) -> list[R
     for _ in range(SETTINGS.max_drawn):
         if len(places) == count:
             return places
-        centre = mean[round(rng.uniform(*SETTINGS.along) * (len(mean) - 1))] + _in_ball(rng, SETTINGS.within)
+        centre = mean[round(rng.uniform(*SETTINGS.along) * (len(mean) - 1))] + in_ball(rng, SETTINGS.within, 1)[0]
         sphere = Sphere(as_point(centre), 0.15)
         if any(sphere.signed_distance(path).min() >= 0 for path in undisturbed):
             continue
@@ -209,7 +195,7 @@ def drawn(problem: Problem, count: int, num_perturbed: int, seed: int) -> list[R
         beside = np.random.default_rng([seed, len(places)])  # places do not depend on how many starts there are
         places.append(RandomPlace(sphere, _perturbed(problem, sphere, share, beside)))
     found = f"{len(places)} of {task.title!r} among {SETTINGS.max_drawn} spheres"
-    raise InputError("--count", found, "places at which each motion collides and the ends are free, fewer of them")
+    raise FormatError("--count", found, "places at which each motion collides and the ends are free, fewer of them")
 
 
 def _perturbed(problem: Problem, sphere: Sphere, num: int, rng: np.random.Generator) -> Array:
@@ -220,16 +206,11 @@ def _perturbed(problem: Problem, sphere: Sphere, num: int, rng: np.random.Genera
         if len(found) == num:
             break
         nearest = int(rng.integers(len(starts)))
-        start = starts[nearest] + _in_ball(rng, SETTINGS.perturbed_by)
+        start = starts[nearest] + in_ball(rng, SETTINGS.perturbed_by, 1)[0]
         posture = track(robot, start[None], problem.postures[nearest][0])
         if posture.error[0] < 1e-3 and robot.collision.obstacle_distance(posture.q, sphere)[0].min() > 0:
             found.append(start)
     return np.array(found).reshape(-1, 3)
-
-
-def _in_ball(rng: np.random.Generator, radius: float) -> Array:
-    direction = rng.normal(size=3)
-    return radius * rng.uniform() ** (1 / 3) * direction / np.linalg.norm(direction)
 
 
 def measured(planner: Planner, problem: Problem, places: Sequence[RandomPlace]) -> dict[str, Array]:
@@ -241,52 +222,47 @@ def measured(planner: Planner, problem: Problem, places: Sequence[RandomPlace]) 
     task, goal = problem.task, problem.learned.goal
     arrays: dict[str, Array] = {f"demo_{i}": path for i, path in enumerate(task.paths)}
     arrays |= {f"demo_t_{i}": d.times for i, d in enumerate(task.demonstrations)}
-    table: dict[str, list[Any]] = {column: [] for column in COLUMNS}
+    rows, reached, seconds = [], [], []
     for k, place in enumerate(places):
         began = time.thread_time()
-        plan = planner.plan(place.obstacle, task.starts)
-        seconds = time.thread_time() - began
-        rows = []
-        for i, (x, t, q) in enumerate(zip(plan.paths, plan.times, joints_along(problem, plan), strict=True)):
-            arrays |= {f"x_{k}_{i}": x, f"t_{k}_{i}": t, f"q_{k}_{i}": q}
-            rows.append(measure(problem.robot, x, t, q, task.paths[i], goal, place.obstacle))
-        for value in fields(Measured):
-            table[value.name].append([getattr(row, value.name) for row in rows])
+        plan = planner(place.obstacle, task.starts)
+        seconds.append(time.thread_time() - began)
+        for i, motion in enumerate(zip(plan.paths, plan.times, joints_along(problem, plan), strict=True)):
+            arrays |= {f"{name}_{k}_{i}": values for name, values in zip("xtq", motion, strict=True)}
+            rows.append(measure(problem, *motion, task.paths[i], place.obstacle))
         ends = _ends(planner, place)
         arrays |= {f"obstacle_{k}": np.array([*place.sphere.position, place.sphere.diameter])}
-        arrays |= {f"perturbed_{k}": place.perturbed, f"ends_{k}": ends}
-        table["reached"].append(
-            np.mean(np.linalg.norm(ends - goal, axis=1) <= SETTINGS.reached) if len(ends) else np.nan
-        )
-        table["seconds"].append(seconds)
-    return {**arrays, "goal": goal, **{column: np.array(values) for column, values in table.items()}}
+        arrays |= {f"perturbed_{k}": place.perturbed, f"ends_{k}": ends, "goal": goal}
+        near = np.linalg.norm(ends - goal, axis=1) <= SETTINGS.reached
+        reached.append(near.mean() if len(near) else np.nan)
+    of_motions = np.array(rows).T.reshape(len(OF_MOTIONS), len(places), -1)
+    return arrays | dict(zip(COLUMNS, (*of_motions, np.array(reached), np.array(seconds)), strict=True))
 
 
-def measure(robot: Robot, x: Array, t: Array, q: Array, demonstration: Array, goal: Array, obstacle: Union) -> Measured:
-    """Measure one motion.
+def measure(problem: Problem, x: Array, t: Array, q: Array, demonstration: Array, obstacle: Union) -> list[float]:
+    """Measure one motion: the columns `OF_MOTIONS`.
 
     Args:
-        robot: the arm.
+        problem: the task and the arm.
         x: (N, 3) path of the end effector, metres.
         t: (N,) its times, seconds.
         q: (M, n) postures of the arm along it, rad.
         demonstration: (T, 3), metres.
-        goal: (3,), metres.
         obstacle: what was to be avoided.
     """
-    nearest = robot.collision.nearest_to_obstacle(q, obstacle)
+    clearance = problem.robot.collision.nearest_to_obstacle(q, obstacle).distance
     path = x if len(x) > 1 else np.repeat(x, 2, axis=0)
     warped, matched = [resample_by_arc_length(p, 200) for p in (path, demonstration)]
-    return Measured(
-        frechet=float(frechet([path], [demonstration])[0]),
-        dtw=dynamic_time_warping(warped, matched) / len(matched),
-        arm_depth=max(0.0, -nearest.distance),
-        hand_depth=maximum_collision_distance(path, obstacle.signed_distance) + 0.0,  # never -0
-        clearance=nearest.distance,
-        goal_error=float(np.linalg.norm(x[-1] - goal)),
-        turn=sharpest_turn(x, TURN_ARC),
-        jerk=rms_jerk(t, x, 0.05),  # the paper's 20 Hz
-    )
+    return [
+        float(frechet([path], [demonstration])[0]),
+        dynamic_time_warping(warped, matched) / len(matched),
+        max(0.0, -clearance),
+        maximum_collision_distance(path, obstacle.signed_distance) + 0.0,  # never -0
+        clearance,
+        float(np.linalg.norm(x[-1] - problem.learned.goal)),
+        sharpest_turn(x, TURN_ARC),
+        rms_jerk(t, x, 0.05),  # the paper's 20 Hz
+    ]
 
 
 def joints_along(problem: Problem, plan: Plan) -> tuple[Array, ...]:
@@ -303,26 +279,21 @@ def _ends(planner: Planner, place: RandomPlace) -> Array:
     if not len(place.perturbed):
         return place.perturbed
     try:
-        return np.stack([path[-1] for path in planner.plan(place.obstacle, place.perturbed).paths])
+        return np.stack([path[-1] for path in planner(place.obstacle, place.perturbed).paths])
     except UnreachableError:
         return np.full_like(place.perturbed, np.inf)
 
 
 def cells(method: str, task: str, arrays: Mapping[str, Array]) -> dict[str, dict[str, float | None]]:
     """The cells of a method's file, by column; None is unknown."""
-    found: dict[str, dict[str, float | None]] = {}
-    of_method = PAPER.get(method, ())
-    values = of_method[PAPER_TASKS.index(task)] if task in PAPER_TASKS[: len(of_method)] else (None, None)
-    paper: Mapping[str, float | None] = {"frechet": values[0], "arm_depth": values[1]}
+    frechet, depth = PAPER[method][PAPER_TASKS.index(task)] if method in PAPER else (None, None)
+    paper, found = {"frechet": frechet, "arm_depth": depth}, {}
     for column in COLUMNS:
-        values = arrays[column]
-        known = bool(np.isfinite(values).all())
-        worst = values.min() if column in SMALLEST else values.max()
-        found[column] = {
-            "mean": float(values.mean()) if known else None,
-            "worst": float(worst) if known else None,
-            "paper": paper.get(column),
-        }
+        known = arrays[column] if np.isfinite(arrays[column]).all() else None
+        worst = np.min if column in SMALLEST else np.max
+        of_ours = {"mean": np.mean, "worst": worst}
+        found[column] = {name: None if known is None else float(of(known)) for name, of in of_ours.items()}
+        found[column]["paper"] = paper.get(column)
     return found
 
 

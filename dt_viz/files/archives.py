@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import json
 import re
-import struct
-import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import scipy.io
@@ -24,9 +22,9 @@ LASA_UNITS = {"length": 1e-3, "time": 1.0}
 """Units of the LASA handwriting data: millimetres and seconds."""
 
 
-def read_npz(file: BinaryIO, source: Path, options: ReadOptions) -> Iterator[Table]:
+def read_npz(path: Path, options: ReadOptions) -> Iterator[Table]:
     """Read named arrays; ``times_i``, ``positions_i`` and ``name_i``, as this program writes them, are metres."""
-    arrays = arrays_of(file, max_bytes=LIMITS.bytes)
+    arrays = arrays_of(path, max_bytes=LIMITS.bytes)
     ours = all(re.fullmatch(r"(?:times|positions|orientations_wxyz|name)_\d+", key) for key in arrays)
     timed, placed = (
         {key.rpartition("_")[2] for key in arrays if key.startswith(f"{part}_")} for part in ("times", "positions")
@@ -34,14 +32,14 @@ def read_npz(file: BinaryIO, source: Path, options: ReadOptions) -> Iterator[Tab
     if ours and timed and placed and timed != placed:
         number = min(timed ^ placed)
         raise FormatError("arrays", f"only one of times_{number} and positions_{number}", "both")
-    for table in tables_of(arrays, source.stem, options.joint_names):
+    for table in tables_of(arrays, path.stem, options.joint_names):
         yield Table(table.name, table.columns, units={"length": 1.0, "time": 1.0} if ours else {})
 
 
-def read_npy(file: BinaryIO, source: Path, options: ReadOptions) -> Iterator[Table]:
+def read_npy(path: Path, options: ReadOptions) -> Iterator[Table]:
     """Read one array (T, d) or (N, T, d), perhaps with named fields."""
     try:
-        array = np.load(file, allow_pickle=False)
+        array = np.load(path, allow_pickle=False)
     except ValueError as error:
         if "allow_pickle" not in str(error):
             raise
@@ -49,16 +47,15 @@ def read_npy(file: BinaryIO, source: Path, options: ReadOptions) -> Iterator[Tab
         raise FormatError("array", "Python objects, which are never unpickled", accepted) from error
     if not isinstance(array, np.ndarray):
         raise FormatError("file", "an archive of several arrays", "one array, or the suffix .npz")
-    yield from tables_of(array, source.stem, options.joint_names)
+    yield from tables_of(array, path.stem, options.joint_names)
 
 
-def read_mat(file: BinaryIO, source: Path, options: ReadOptions) -> Iterator[Table]:
+def read_mat(path: Path, options: ReadOptions) -> Iterator[Table]:
     """Read MATLAB variables; ``demos``, a cell array of structures with t and pos, is LASA's, in millimetres."""
-    _check_matlab(file)
-    variables = scipy.io.loadmat(file, simplify_cells=True)
+    variables = scipy.io.loadmat(path, simplify_cells=True)
     if "demos" not in variables:
         yield from tables_of(
-            {k: v for k, v in variables.items() if not k.startswith("__")}, source.stem, options.joint_names
+            {k: v for k, v in variables.items() if not k.startswith("__")}, path.stem, options.joint_names
         )
         return
     recordings = np.atleast_1d(np.asarray(variables["demos"], dtype=object)).ravel()
@@ -71,45 +68,18 @@ def read_mat(file: BinaryIO, source: Path, options: ReadOptions) -> Iterator[Tab
             raise FormatError(f"demos{{{i + 1}}}.t", f"an array of shape {times.shape}", "1×T")
         if positions.ndim != 2 or len(positions) not in (2, 3):
             raise FormatError(f"demos{{{i + 1}}}.pos", f"an array of shape {positions.shape}", "d×T, d is 2 or 3")
-        yield Table(f"{source.stem} {i}", {"t": times, "pos": positions.T}, units=LASA_UNITS)
+        yield Table(f"{path.stem} {i}", {"t": times, "pos": positions.T}, units=LASA_UNITS)
 
 
-def _check_matlab(file: BinaryIO) -> None:
-    """Raise FormatError if a MATLAB file has elements of unknown types, which crash scipy's reader."""
-    head = file.read(128)
-    if len(head) == 128 and all(head[:4]):  # version 4 has no text there, and 7.3 is refused by scipy
-        _check_elements(memoryview(file.read()), ">" if head[126:] == b"MI" else "<")
-    file.seek(0)
-
-
-def _check_elements(data: memoryview, order: str) -> None:
-    """Check the elements that follow each other in a MATLAB file of version 5, or in a part of it."""
-    place = 0
-    while place < len(data):
-        kind, size = struct.unpack_from(f"{order}II", data, place)
-        place += 8
-        if not 1 <= kind & 0xFFFF <= 18 or (kind < 2**16 and size > len(data) - place):
-            raise FormatError("file", f"a broken element of type {kind & 0xFFFF}", "a whole MATLAB file")
-        if kind == 15:  # compressed
-            unpacked = zlib.decompressobj().decompress(data[place : place + size], LIMITS.bytes + 1)
-            check_size(len(unpacked), LIMITS.bytes)
-            _check_elements(memoryview(unpacked), order)
-        elif kind == 14:  # made of elements
-            _check_elements(data[place : place + size], order)
-        if kind < 2**16:  # the data of others stand in the place of their size
-            place += size + (-size % 8 if kind != 15 else 0)
-
-
-def read_json(file: BinaryIO, source: Path, options: ReadOptions) -> Iterator[Table]:
+def read_json(path: Path, options: ReadOptions) -> Iterator[Table]:
     """Read lists of numbers, records with named fields, or mappings of them."""
-    content = file.read(LIMITS.text + 1)
-    check_size(len(content), LIMITS.text)
-    yield from tables_of(json.loads(content), source.stem, options.joint_names)
+    check_size(path.stat().st_size, LIMITS.text)
+    yield from tables_of(json.loads(path.read_bytes()), path.stem, options.joint_names)
 
 
-def read_parquet(content: BinaryIO, source: Path, options: ReadOptions) -> Iterator[Table]:
+def read_parquet(path: Path, options: ReadOptions) -> Iterator[Table]:
     """Read a table, such as LeRobot's: ``observation.state``, ``timestamp``, ``episode_index``."""
-    file = imported("pyarrow.parquet", "parquet").ParquetFile(content, pre_buffer=False)
+    file = imported("pyarrow.parquet", "parquet").ParquetFile(path, pre_buffer=False)
     given = {name.lower() for name in options.roles.values()}
     kinds = {field.name: str(field.type) for field in file.schema_arrow}
     names = [
@@ -128,10 +98,10 @@ def read_parquet(content: BinaryIO, source: Path, options: ReadOptions) -> Itera
             parts[name].append(values.reshape(len(column), -1) if whole else values.copy())
     columns = {name: np.concatenate(parts.pop(name)) for name in names if parts[name]}
     imported("pyarrow", "parquet").default_memory_pool().release_unused()
-    yield Table(source.stem, columns, unused=tuple(name for name in kinds if name not in columns))
+    yield Table(path.stem, columns, unused=tuple(name for name in kinds if name not in columns))
 
 
-def read_hdf5(file: BinaryIO, source: Path, options: ReadOptions) -> Iterator[Table]:
+def read_hdf5(path: Path, options: ReadOptions) -> Iterator[Table]:
     """Read groups of arrays, such as robomimic's: ``data/demo_0/obs/robot0_eef_pos``; pictures are left out."""
     h5py = imported("h5py", "hdf5")
     size = 0
@@ -153,11 +123,11 @@ def read_hdf5(file: BinaryIO, source: Path, options: ReadOptions) -> Iterator[Ta
                 raise complex_numbers(key)
         return tree
 
-    with h5py.File(file, "r") as archive:
+    with h5py.File(path, "r") as archive:
         tree = tree_of(archive)
         data = archive.get("data")
         rate = _control_rate(data.attrs.get("env_args", "")) if isinstance(data, h5py.Group) else None
-    for table in tables_of(tree, source.stem, options.joint_names):
+    for table in tables_of(tree, path.stem, options.joint_names):
         columns = table.columns if rate is None else {**table.columns, "rate": np.array(rate)}
         yield Table(table.name, columns)
 

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -17,37 +15,19 @@ from dt_viz.files.tables import LIMITS, ReadOptions, Table, imported
 
 POSES = ("PoseStamped", "Pose", "PoseWithCovarianceStamped", "Odometry", "TransformStamped", "PointStamped", "Point")
 TRANSFORMS, JOINTS = ("TFMessage", "tfMessage"), "JointState"
-KINDS = (*POSES, *TRANSFORMS, JOINTS)
-"""Types of messages that are read, the first that a bag has first."""
+RANKS = {**dict.fromkeys(POSES, 0), **dict.fromkeys(TRANSFORMS, 1), JOINTS: 2}
+"""Types of messages that are read; of those in a bag, the ones of the lowest rank."""
 
 Samples = list[tuple[int, tuple[float, ...]]]
 """Times, nanoseconds, and places, perhaps with orientations x, y, z, w."""
 
 
-def read_bag(file: BinaryIO, source: Path, options: ReadOptions) -> Iterator[Table]:
-    """Read the poses or joint angles of one topic of a bag.
+def read_bag(path: Path, options: ReadOptions) -> Iterator[Table]:
+    """Read the poses or joint angles of one topic of a bag, a file or a folder.
 
     Raises:
         FormatError: no topic has any, or several have and none is chosen; the message lists the topics.
     """
-    with _on_disk(file, source) as path:
-        yield from read_bag_at(path, source.stem, options)
-
-
-@contextmanager
-def _on_disk(file: BinaryIO, source: Path) -> Iterator[Path]:
-    """Path of a file for what cannot read from memory."""
-    if isinstance(name := getattr(file, "name", None), str):
-        yield Path(name)
-        return
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / f"bag{source.suffix.lower()}"
-        path.write_bytes(file.read())
-        yield path
-
-
-def read_bag_at(path: Path, name: str, options: ReadOptions) -> Iterator[Table]:
-    """Read a bag, a file or a folder; see `read_bag`."""
     reader = imported("rosbags.highlevel", "ros").AnyReader
     typesys = imported("rosbags.typesys", "ros")
     with reader([path], default_typestore=typesys.get_typestore(typesys.Stores.LATEST)) as bag:
@@ -58,13 +38,16 @@ def read_bag_at(path: Path, name: str, options: ReadOptions) -> Iterator[Table]:
         check_at_most("bag", sum(connection.msgcount for connection in chosen), LIMITS.numbers // 8, "messages")
         kind = _kind(chosen[0])
         if kind == JOINTS:
-            yield Table(name, _joint_columns(messages))
+            yield Table(path.stem, _joint_columns(messages))
             return
-        samples = _samples(messages, frame, chosen[0].topic) if kind in TRANSFORMS else _poses(messages)
+        if kind in TRANSFORMS:
+            samples = _samples(messages, frame, chosen[0].topic)
+        else:
+            samples = [(_stamp(message, time), _place(message)) for time, message in messages]
     times = np.array([time for time, _ in samples], dtype=np.int64)
     values = np.array([place for _, place in samples]).reshape(len(samples), -1)
     names = ("x", "y", "z", "qx", "qy", "qz", "qw")[: values.shape[1]]
-    yield Table(name, {"t": _seconds(times)} | {name: values[:, k] for k, name in enumerate(names)})
+    yield Table(path.stem, {"t": _seconds(times)} | {name: values[:, k] for k, name in enumerate(names)})
 
 
 def _kind(connection: Any) -> str:  # noqa: ANN401 - of rosbags
@@ -74,28 +57,23 @@ def _kind(connection: Any) -> str:  # noqa: ANN401 - of rosbags
 def _chosen(bag: Any, topic: str | None) -> tuple[list[Any], str | None]:  # noqa: ANN401 - of rosbags
     """Connections of the one topic that is read, and the frame of transforms if one is given."""
     listed = ", ".join(f"{c.topic} ({_kind(c)})" for c in {c.topic: c for c in bag.connections}.values())[:200]
-    usable = [connection for connection in bag.connections if _kind(connection) in KINDS and connection.msgcount]
+    usable = [connection for connection in bag.connections if _kind(connection) in RANKS and connection.msgcount]
     if not usable:
         found = f"no poses among the topics {listed}" if listed else "no topics"
-        raise FormatError("bag", found, f"messages of the types {', '.join(KINDS)}")
+        raise FormatError("bag", found, f"messages of the types {', '.join(RANKS)}")
     named = [connection for connection in usable if connection.topic == topic]
     if topic is not None and not named:
         transforms = [connection for connection in usable if _kind(connection) in TRANSFORMS]
         if not transforms:
             raise FormatError("topic", f"{topic!r}, but the topics {listed}", "one of them with poses or joint angles")
         return transforms, topic
-    best = min(KINDS.index(_kind(connection)) for connection in usable)
-    ranked = named or [connection for connection in usable if _rank(_kind(connection)) == _rank(KINDS[best])]
+    best = min(RANKS[_kind(connection)] for connection in usable)
+    ranked = named or [connection for connection in usable if RANKS[_kind(connection)] == best]
     topics = list(dict.fromkeys(connection.topic for connection in ranked))
     if len(topics) > 1 and _kind(ranked[0]) not in TRANSFORMS:
         found = f"poses or joint angles on the topics {listed}"
         raise UnclearError("bag", found, "topic='…', one of them", "topic", topics)
     return ranked, None
-
-
-def _rank(kind: str) -> int:
-    """Poses come before transforms, and these before joint angles."""
-    return 0 if kind in POSES else 1 if kind in TRANSFORMS else 2
 
 
 def _stamp(message: Any, time: int) -> int:  # noqa: ANN401 - a message
@@ -117,10 +95,6 @@ def _place(message: Any) -> tuple[float, ...]:  # noqa: ANN401 - a message, or a
     orientation = getattr(message, "orientation", getattr(message, "rotation", None))
     turn = () if orientation is None else (orientation.x, orientation.y, orientation.z, orientation.w)
     return (position.x, position.y, position.z, *turn)
-
-
-def _poses(messages: Iterator[tuple[int, Any]]) -> Samples:
-    return [(_stamp(message, time), _place(message)) for time, message in messages]
 
 
 def _samples(messages: Iterator[tuple[int, Any]], frame: str | None, topic: str) -> Samples:

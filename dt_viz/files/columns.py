@@ -26,27 +26,16 @@ _SYNONYMS = {
     **dict.fromkeys(("msec", "msecs", "millis", "milliseconds"), "ms"),
     **dict.fromkeys(("usec", "usecs", "micros", "microseconds"), "us"),
     **dict.fromkeys(("nsec", "nsecs", "nanosec", "nanosecs", "nanos", "nanoseconds"), "ns"),
-    **dict.fromkeys(("metres", "meters"), "m"),
-    **dict.fromkeys(("millimetres", "millimeters"), "mm"),
-    **dict.fromkeys(("degree", "degrees"), "deg"),
-    **dict.fromkeys(("radian", "radians"), "rad"),
+    **{"metres": "m", "meters": "m", "millimetres": "mm", "millimeters": "mm"},
+    **{"degree": "deg", "degrees": "deg", "radian": "rad", "radians": "rad"},
 }
 TIMES = {"t", "time", "times", "timestamp", "timestamps", "stamp", "stamps", "elapsed"}
 LABELS = ("demo", "demonstration", "take", "trial", "episode", "trajectory", "traj", "run", "recording")
 RATES = {"rate", "fps", "hz", "frequency", "control_freq", "dt"}
 POSITIONS = {"p", "pos", "position", "positions", "translation", "xyz", "xy", "points", "path"}
 ORIENTATIONS = {
-    "q",
-    "quat",
-    "quats",
-    "quaternion",
-    "quaternions",
-    "ori",
-    "orientation",
-    "orientations",
-    "rot",
-    "rotation",
-    "rotations",
+    *("q", "quat", "quats", "quaternion", "quaternions", "ori", "orientation", "orientations"),
+    *("rot", "rotation", "rotations"),
 }
 HAND = {
     *("field", "pose", "poses", "point", "transform", "msg", "data", "obs", "observation", "state", "robot", "robot0"),
@@ -345,10 +334,7 @@ def _position_columns(
     names: Sequence[str], roles: Mapping[str, Role], given: Sequence[str]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the columns x, y and perhaps z of one group of words, and these words."""
-    groups: dict[tuple[str, ...], dict[str, str]] = {}
-    for name in names:
-        groups.setdefault(roles[name].group, {}).setdefault(roles[name].part, name)
-    whole = {group: axes for group, axes in groups.items() if {"x", "y"} <= set(axes)}
+    whole = _whole_groups(names, roles, "xy")
     if not whole:
         return (), ()
     best = {group: roles[axes["x"]].rank for group, axes in whole.items()}
@@ -360,11 +346,14 @@ def _position_columns(
 
 def _orientation_columns(names: Sequence[str], roles: Mapping[str, Role], group: Sequence[str]) -> tuple[str, ...]:
     """Return the columns w, x, y, z whose words are most like those of the positions; none if some are missing."""
+    whole = _whole_groups(names, roles, "wxyz")
+    best = whole[max(whole, key=lambda words: len(set(group) & set(words)))] if whole else {}
+    return tuple(best[axis] for axis in "wxyz" if best)
+
+
+def _whole_groups(names: Sequence[str], roles: Mapping[str, Role], axes: str) -> dict[tuple[str, ...], dict[str, str]]:
+    """Return the columns of each group of words by their axis, if it has these axes."""
     groups: dict[tuple[str, ...], dict[str, str]] = {}
     for name in names:
         groups.setdefault(roles[name].group, {}).setdefault(roles[name].part, name)
-    whole = [axes for axes in groups.values() if len(axes) == 4]
-    if not whole:
-        return ()
-    best = max(whole, key=lambda axes: len(set(group) & set(roles[axes["x"]].group)))
-    return tuple(best[axis] for axis in "wxyz")
+    return {group: parts for group, parts in groups.items() if set(axes) <= set(parts)}

@@ -9,11 +9,11 @@ from typing import Any
 
 from dt_viz.errors import FormatError
 from dt_viz.files.archives import read_parquet
-from dt_viz.files.bags import read_bag_at
+from dt_viz.files.bags import read_bag
 from dt_viz.files.checks import check_size
 from dt_viz.files.columns import role_of
 from dt_viz.files.tables import LIMITS, ReadOptions, Table
-from dt_viz.files.takes import READERS, Take, takes_of
+from dt_viz.files.takes import READERS, Take, read_takes, takes_of
 
 NOTES = (".txt", ".dat", ".json")
 """Suffixes of files that beside others are notes rather than motions."""
@@ -30,44 +30,50 @@ def files_of(folder: Path) -> list[Path]:
     return [path for path in known if path.suffix.lower() not in NOTES] or known
 
 
-def is_bag(folder: Path) -> bool:
-    """Tell whether a folder is one ROS 2 bag."""
+def _is_bag(folder: Path) -> bool:
     return (folder / "metadata.yaml").is_file()
 
 
-def is_lerobot(folder: Path) -> bool:
-    """Tell whether a folder is a LeRobot data set."""
+def _is_lerobot(folder: Path) -> bool:
     return (folder / "meta" / "info.json").is_file()
 
 
-def bag_folder(folder: Path, options: ReadOptions) -> tuple[list[Take], tuple[str, ...]]:
-    """Read the take of a ROS 2 bag; see `takes_of` for what is returned and raised."""
-    check_size(sum(path.stat().st_size for path in folder.iterdir()), LIMITS.bytes)
-    return takes_of(read_bag_at(folder, folder.name, options), options)
+def parts_of(path: Path) -> list[Path]:
+    """Return what is read at a path: the files of a folder, unless it is one bag or data set; or the path itself."""
+    return files_of(path) if path.is_dir() and not _is_bag(path) and not _is_lerobot(path) else [path]
 
 
-def lerobot_folder(folder: Path, options: ReadOptions) -> tuple[list[Take], tuple[str, ...]]:
-    """Read the episodes of a LeRobot data set, its states named as it says; see `takes_of`."""
-    information = json.loads((folder / "meta" / "info.json").read_text(encoding="utf-8"))
-    files = sorted((folder / "data").rglob("*.parquet"))
-    check_size(sum(path.stat().st_size for path in files), LIMITS.bytes)
+def accepted_as(path: Path) -> str:
+    """Describe what is accepted there."""
+    return READERS.get(path.suffix.lower(), (None, "a file of recorded motions"))[1]
+
+
+def read_part(path: Path, options: ReadOptions) -> tuple[list[Take], tuple[str, ...]]:
+    """Read the takes of a file, of a ROS 2 bag's folder, or of a LeRobot data set; see `read_takes`."""
+    if not path.is_dir():
+        return read_takes(path, options)
+    if _is_bag(path):
+        check_size(sum(file.stat().st_size for file in path.iterdir()), LIMITS.bytes)
+        return takes_of(read_bag(path, options), options)
+    information = json.loads((path / "meta" / "info.json").read_text(encoding="utf-8"))
+    files = sorted((path / "data").rglob("*.parquet"))
+    check_size(sum(file.stat().st_size for file in files), LIMITS.bytes)
     if not files:
         raise FormatError("folder", "no .parquet file in data/", "a LeRobot data set")
     return takes_of(_tables(files, information.get("features", {}), options), options)
 
 
 def _tables(files: list[Path], features: Mapping[str, Any], options: ReadOptions) -> Iterator[Table]:
-    for path in files:
-        with path.open("rb") as file:
-            for table in read_parquet(file, path, options):
-                columns: dict[str, Any] = {}
-                for name, values in table.columns.items():
-                    parts = _part_names(features.get(name, {}))
-                    if values.ndim == 2 and len(parts) == values.shape[1]:
-                        columns |= {f"{name}.{part}": values[:, k] for k, part in enumerate(parts)}
-                    else:
-                        columns[name] = values
-                yield Table(table.name, columns, unused=table.unused)
+    """Tables of a data set, the columns of states named as it says."""
+    for table in (table for path in files for table in read_parquet(path, options)):
+        columns: dict[str, Any] = {}
+        for name, values in table.columns.items():
+            parts = _part_names(features.get(name, {}))
+            if values.ndim == 2 and len(parts) == values.shape[1]:
+                columns |= {f"{name}.{part}": values[:, k] for k, part in enumerate(parts)}
+            else:
+                columns[name] = values
+        yield Table(table.name, columns, unused=table.unused)
 
 
 def _part_names(feature: Mapping[str, Any]) -> list[str]:

@@ -9,20 +9,18 @@ import zipfile
 from collections.abc import Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
 from dt_viz.errors import FormatError
 
 
-def arrays_of(
-    content: bytes | BinaryIO, *, max_bytes: int, names: Collection[str] | None = None
-) -> dict[str, np.ndarray]:
+def arrays_of(content: bytes | Path, *, max_bytes: int, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
     """Read the arrays of an npz archive.
 
     Args:
-        content: all bytes of the file, or the file.
+        content: all bytes of the file, or its path.
         max_bytes: largest number of bytes that it may unpack to, as its directory says.
         names: names of the arrays to read; None reads all.
 
@@ -37,8 +35,9 @@ def arrays_of(
         raise FormatError("file", f"{size} bytes when unpacked", f"at most {max_bytes} bytes")
     if names is not None and not names:
         return {}
+    if isinstance(file, io.BytesIO):
+        file.seek(0)
     arrays = {}
-    file.seek(0)
     with np.load(file, allow_pickle=False) as archive:
         for name in archive.files if names is None else [name for name in names if name in archive.files]:
             accepted = "numbers or text as numpy writes them; pickled objects are never opened"

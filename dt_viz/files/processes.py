@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -13,6 +15,8 @@ def start_module(
     name: str, *arguments: str, output: int | IO[Any], given: int = subprocess.DEVNULL, temporary: str | None = None
 ) -> subprocess.Popen:
     """Start a module of this package as a process, with one thread for linear algebra.
+
+    With a folder of temporary files it has a session of its own, which `end_session` ends with all its processes.
 
     Args:
         name: full name of the module.
@@ -31,4 +35,16 @@ def start_module(
         stdin=given,
         stdout=output,
         stderr=subprocess.DEVNULL,
+        start_new_session=temporary is not None,
     )
+
+
+def end_session(process: subprocess.Popen) -> None:
+    """End a process with a session of its own, and what it has started."""
+    if hasattr(os, "killpg") and process.poll() is None:
+        os.killpg(process.pid, signal.SIGKILL)
+    process.kill()
+    process.wait()
+    if process.stdin is not None:
+        with suppress(OSError):  # what it has not taken
+            process.stdin.close()

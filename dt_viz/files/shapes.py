@@ -8,7 +8,9 @@ from __future__ import annotations
 import csv
 import io
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +18,7 @@ import trimesh
 from trimesh.exchange.ply import load_ply
 
 from dt_viz.errors import FormatError
-from dt_viz.files.checks import MAX_FACES, check_at_most, check_triangles, too_many
+from dt_viz.files.checks import MAX_FACES, check_at_most, check_finite, check_triangles, real_numbers, too_many
 from dt_viz.files.npz import arrays_of
 from dt_viz.files.repair import repaired
 from dt_viz.numerics import Array, Indices
@@ -43,60 +45,85 @@ TEXTS = (".obj", ".off", ".csv", ".stl", ".ply", ".gltf")
 EXTENSIONS = (b"KHR_draco_mesh_compression", b"EXT_meshopt_compression", b"EXT_mesh_gpu_instancing")
 """Extensions of glTF files that change triangles, and are not read."""
 
-Answer = tuple[tuple[np.ndarray, ...], tuple[str, ...]]
-"""Arrays of a file, and notes about them for the page."""
+Files = Sequence[tuple[str, bytes]]
+"""Names and contents."""
+Columns = tuple[np.ndarray, np.ndarray | None, tuple[str, ...]]
+"""Points, labels and notes of `Points`, of any type."""
 
 
-def read_mesh(content: bytes, suffix: str) -> Answer:
-    """Read vertices (V, 3) and triangles (F, 3) of a file, all parts in their places, and repair them.
+@dataclass(frozen=True)
+class Triangles:
+    """A mesh that was read and repaired."""
+
+    vertices: Array
+    """(V, 3)"""
+    faces: Indices
+    """(F, 3), indices of vertices."""
+    notes: tuple[str, ...]
+    """What was repaired, for the page."""
+
+
+@dataclass(frozen=True)
+class Points:
+    """A point cloud that was read."""
+
+    points: Array
+    """(K, 3)"""
+    labels: Array | None
+    """(K,) 1 occupied and 0 free; None where there are none."""
+    notes: tuple[str, ...]
+    """What was left out, for the page."""
+
+
+def read_triangles(files: Files) -> Triangles:
+    """Read the vertices and triangles of a file, all parts in their places, and repair them.
 
     Raises:
         FormatError: it has no triangles, or too many.
         Exception: of any kind, on hostile bytes.
     """
-    _check_text(content, suffix)
-    _check_model(content, suffix)
+    content, suffix = _opened(files)
     vertices, faces = _triangles(content, suffix)
     if not len(faces):
         accepted = f"a complete {suffix} file of a closed mesh; a point cloud is loaded as a cloud"
         raise FormatError("faces", "none that could be read", accepted)
     check_triangles(vertices, faces)
-    vertices, faces, notes = repaired(vertices, faces)
-    return (vertices, faces), notes
+    return Triangles(*repaired(vertices, faces))
 
 
-def read_points(content: bytes, suffix: str) -> Answer:
-    """Read points (K, 3) of a file and, where it has them, their labels (K,).
+def read_points(files: Files) -> Points:
+    """Read the points of a file and, where it has them, their labels.
 
     Raises:
         FormatError: it has no points, or too many.
         Exception: of any kind, on hostile bytes.
     """
-    _check_text(content, suffix)
-    columns, notes = {".npz": _npz_points, ".csv": _csv_points, ".ply": _ply_points}[suffix](content)
-    check_at_most("points", len(columns[0]), LIMITS.points)
-    for array in columns:
-        if array.dtype.kind not in "biuf":
-            raise FormatError("points", f"values of type {array.dtype}", "integers or real numbers")
-    return tuple(array.astype(np.float64) for array in columns), notes
+    content, suffix = _opened(files)
+    points, labels, notes = {".npz": _npz_points, ".csv": _csv_points, ".ply": _ply_points}[suffix](content)
+    check_at_most("points", len(points), LIMITS.points)
+    points = real_numbers(points, "points", "biuf")
+    check_finite(np.atleast_2d(points), "points", lambda row: f"in point {row + 1}")
+    return Points(points, None if labels is None else real_numbers(labels, "labels", "biuf"), notes)
 
 
-def _check_text(content: bytes, suffix: str) -> None:
+def _opened(files: Files) -> tuple[bytes, str]:
+    """Return the content and the suffix of a file. Raises FormatError if it would need too much, or an extension."""
+    ((name, content),) = files
+    suffix = Path(name).suffix.lower()
     if suffix in TEXTS and content.count(b"\n") > LIMITS.lines:
         raise too_many("file", LIMITS.lines, "lines")
-
-
-def _check_model(content: bytes, suffix: str) -> None:
-    """Raise FormatError if a file would unpack to very much, or needs an extension."""
     if suffix == ".3mf":
         arrays_of(content, max_bytes=LIMITS.model, names=())
     if suffix == ".gltf":
         json.loads(content)  # trimesh would look for another file
     if suffix in (".glb", ".gltf"):
         _, found, required = content.partition(b'"extensionsRequired"')
-        for name in EXTENSIONS:
-            if found and name in required:
-                raise FormatError("JSON", f"the extension {name.decode()}", "plain triangles (no Draco, no meshopt)")
+        for extension in EXTENSIONS:
+            if found and extension in required:
+                raise FormatError(
+                    "JSON", f"the extension {extension.decode()}", "plain triangles (no Draco, no meshopt)"
+                )
+    return content, suffix
 
 
 class _OtherFiles:
@@ -129,21 +156,20 @@ def _triangles(content: bytes, suffix: str) -> tuple[Array, Indices]:
             parts.append((part, place))
     vertices, faces, first = [np.empty((0, 3))], [np.empty((0, 3), dtype=np.int64)], 0
     for part, place in parts:
-        vertices.append(part.vertices @ place[:3, :3].T + place[:3, 3])
-        mirrored = np.linalg.det(place[:3, :3]) < 0
-        faces.append(first + (part.faces[:, ::-1] if mirrored else part.faces))
+        vertices.append(trimesh.transform_points(part.vertices, place))
+        faces.append(first + (part.faces[:, ::-1] if np.linalg.det(place[:3, :3]) < 0 else part.faces))
         first += len(part.vertices)
     return np.concatenate(vertices), np.concatenate(faces)
 
 
-def _npz_points(content: bytes) -> Answer:
+def _npz_points(content: bytes) -> Columns:
     arrays = arrays_of(content, max_bytes=LIMITS.unpacked, names=("points", "labels"))
     if "points" not in arrays:
         raise FormatError("arrays", "no 'points'", "'points' and optionally 'labels'")
-    return tuple(arrays[name] for name in ("points", "labels") if name in arrays), ()
+    return arrays["points"], arrays.get("labels"), ()
 
 
-def _csv_points(content: bytes) -> Answer:
+def _csv_points(content: bytes) -> Columns:
     """Read columns by their names, in any order."""
     first, _, rows = content.decode("utf-8-sig").partition("\n")
     header = [name.strip().lower() for name in next(csv.reader([first]), [])]
@@ -152,17 +178,16 @@ def _csv_points(content: bytes) -> Answer:
         raise FormatError("header line", repr(",".join(header)[:80]), "'x,y,z' or 'x,y,z,occupied', in any order")
     if not rows.strip():  # numpy would warn
         raise FormatError("points", "0", "one line per point")
-    columns = [header.index(name) for name in wanted]
-    table = np.loadtxt(
-        io.StringIO(rows), delimiter=",", usecols=columns, ndmin=2, max_rows=LIMITS.points + 1, comments=None
-    )
+    columns, most = [header.index(name) for name in wanted], LIMITS.points + 1
+    table = np.loadtxt(io.StringIO(rows), delimiter=",", usecols=columns, ndmin=2, max_rows=most, comments=None)
     others = [name for name in header if name not in wanted]
     notes = (f"columns {', '.join(others)[:80]} are not used",) if others else ()
-    return (table[:, :3], *table[:, 3:].T), notes
+    return table[:, :3], table[:, 3] if len(wanted) > 3 else None, notes
 
 
-def _ply_points(content: bytes) -> Answer:
+def _ply_points(content: bytes) -> Columns:
     vertex = load_ply(io.BytesIO(content), skip_materials=True)["metadata"]["_ply_raw"]["vertex"]
     columns = vertex["data"] if vertex["length"] else dict.fromkeys("xyz", np.empty(0))
     points = np.stack([np.ravel(columns[axis]) for axis in "xyz"], axis=1)
-    return (points, *[np.ravel(columns[name]) for name in LABELS if name in vertex["properties"]][:1]), ()
+    label = next((name for name in LABELS if name in vertex["properties"]), None)
+    return points, None if label is None else np.ravel(columns[label]), ()

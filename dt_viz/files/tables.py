@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import csv
 import importlib
-import io
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
 from dt_viz.errors import FormatError
 from dt_viz.files.checks import too_many
-from dt_viz.files.columns import numbered, role_of, unnamed
+from dt_viz.files.columns import role_of
 
 
 @dataclass(frozen=True)
@@ -93,6 +91,8 @@ class Table:
     """Names of columns that were not read."""
     labels: tuple[str, ...] = ()
     """Texts of labels, of which the column of labels holds the indices."""
+    is_text: bool = False
+    """Whether it is text, in which the first of three columns without names may be times."""
 
 
 def imported(module: str, extra: str) -> Any:  # noqa: ANN401 - a module
@@ -108,15 +108,15 @@ def imported(module: str, extra: str) -> Any:  # noqa: ANN401 - a module
         raise FormatError("file", f"a format that needs the package {module.partition('.')[0]}", accepted) from error
 
 
-def read_text(file: BinaryIO, source: Path, options: ReadOptions) -> Iterator[Table]:
+def read_text(path: Path, options: ReadOptions) -> Iterator[Table]:
     """Read a table of text: cells between commas, semicolons, tabs or spaces, with a header or without.
 
     Raises:
         FormatError: a line has other cells than the first, or one that is no number.
     """
-    header, first, skipped, delimiter = _beginning(file)
+    header, first, skipped, delimiter = _beginning(path)
     if not first:
-        yield Table(source.stem, dict.fromkeys(header or ["x", "y"], np.empty(0)))
+        yield Table(path.stem, dict.fromkeys(header or ["x", "y"], np.empty(0)))
         return
     width = len(first)
     if len(header or first) != width:
@@ -138,7 +138,7 @@ def read_text(file: BinaryIO, source: Path, options: ReadOptions) -> Iterator[Ta
     max_rows = LIMITS.numbers // max(len(used), 1)
     fields = [(f"f{k}", "f8" if k in used else "U1") for k in range(width)]
     converters: Any = {k: lambda cell: labels.setdefault(cell.strip(), len(labels)) for k in used if label[k]}
-    lines: Any = (line for _, line in itertools.islice(_rows(file, skipped, delimiter), max_rows + 1))
+    lines: Any = (line for _, line in itertools.islice(_rows(path, skipped, delimiter), max_rows + 1))
     try:
         rows = np.loadtxt(
             lines,
@@ -151,24 +151,18 @@ def read_text(file: BinaryIO, source: Path, options: ReadOptions) -> Iterator[Ta
             encoding=None,
         )
     except ValueError as error:
-        raise _wrong_line(file, skipped, delimiter, used, label) or error from error
+        raise _wrong_line(path, skipped, delimiter, used, label) or error from error
     if len(rows) > max_rows:
         raise too_many("file", max_rows, "lines")
 
-    path = getattr(file, "name", None)
-
     def place(row: int) -> str:
-        with Path(path).open("rb") if path else nullcontext(file) as again:
-            number, _ = next(itertools.islice(_rows(again, skipped, delimiter), row, None))
+        number, _ = next(itertools.islice(_rows(path, skipped, delimiter), row, None))
         return f"at line {number}"
 
-    if not names:
-        matrix = np.stack([rows[f"f{k}"] for k in used], axis=1)
-        how = {"rated": options.rate is not None, "timed": True, "asks": options.asks}
-        names = numbered(width) if options.roles else unnamed(matrix, options.num_joints, **how)
-    columns = {names[k]: rows[f"f{k}"] for k in used}
     unused = tuple(name for k, name in enumerate(names) if k not in used)
-    yield Table(source.stem, columns, place, unused=unused, labels=tuple(labels))
+    values = [rows[f"f{k}"] for k in used]
+    columns = dict(zip([names[k] for k in used], values, strict=True)) if names else {"": np.stack(values, axis=1)}
+    yield Table(path.stem, columns, place, unused=unused, labels=tuple(labels), is_text=True)
 
 
 def _is_label(name: str, options: ReadOptions) -> bool:
@@ -177,48 +171,28 @@ def _is_label(name: str, options: ReadOptions) -> bool:
     return name.lower() == wanted.lower() if wanted else role is not None and role.kind == "label"
 
 
-def _text(file: BinaryIO) -> io.TextIOWrapper:
-    file.seek(0)
-    return io.TextIOWrapper(io.BufferedReader(_Unclosed(file), 2**20), encoding="utf-8-sig", newline="")
-
-
-class _Unclosed(io.RawIOBase):
-    """A file that is not closed with what reads it."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        self._file = file
-
-    def readable(self) -> bool:
-        return True
-
-    def readinto(self, buffer: Any) -> int:  # noqa: ANN401 - a buffer
-        content = self._file.read(len(buffer))
-        buffer[: len(content)] = content
-        return len(content)
-
-
-def _beginning(file: BinaryIO) -> tuple[list[str], list[str], int, str | None]:
+def _beginning(path: Path) -> tuple[list[str], list[str], int, str | None]:
     """Return the header (empty without one), the first row, the number of lines before it, and what parts cells."""
     before: list[str] = []
     delimiter: str | None = None
-    source = _text(file)
-    for number, line in enumerate(iter(lambda: source.readline(2**20), "")):
-        text = line.strip()
-        if not text:
-            continue
-        marked = text[0] == "#" or (text[0] == "%" and not text.lower().startswith("%time"))
-        if not before or before[0] == "#":
-            delimiter = next((mark for mark in "\t;," if mark in text), None)
-        cells = _cells(text.lstrip("#% ") if marked else text, delimiter)
-        if len(cells) > LIMITS.columns:
-            raise too_many("file", LIMITS.columns, "columns")
-        if marked:
-            before = ["#", *cells]
-        elif all(_is_number(cell, delimiter) for cell in cells) or (before and before[0] != "#"):
-            header = before[1:]
-            return (header if before[:1] != ["#"] or len(header) == len(cells) else []), cells, number, delimiter
-        else:
-            before = ["", *cells]
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        for number, line in enumerate(iter(lambda: file.readline(2**20), "")):
+            text = line.strip()
+            if not text:
+                continue
+            marked = text[0] == "#" or (text[0] == "%" and not text.lower().startswith("%time"))
+            if not before or before[0] == "#":
+                delimiter = next((mark for mark in "\t;," if mark in text), None)
+            cells = _cells(text.lstrip("#% ") if marked else text, delimiter)
+            if len(cells) > LIMITS.columns:
+                raise too_many("file", LIMITS.columns, "columns")
+            if marked:
+                before = ["#", *cells]
+            elif all(_is_number(cell, delimiter) for cell in cells) or (before and before[0] != "#"):
+                header = before[1:]
+                return (header if before[:1] != ["#"] or len(header) == len(cells) else []), cells, number, delimiter
+            else:
+                before = ["", *cells]
     return before[1:], [], 0, delimiter
 
 
@@ -236,18 +210,19 @@ def _is_number(cell: str, delimiter: str | None) -> bool:
     return True
 
 
-def _rows(file: BinaryIO, skipped: int, delimiter: str | None) -> Iterator[tuple[int, str]]:
+def _rows(path: Path, skipped: int, delimiter: str | None) -> Iterator[tuple[int, str]]:
     """Number and text of each line with cells, from the first row on; decimal points for commas between semicolons."""
-    for number, line in enumerate(_text(file), 1):
-        if number > skipped and line.strip():
-            yield number, line.replace(",", ".") if delimiter == ";" else line
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        for number, line in enumerate(file, 1):
+            if number > skipped and line.strip():
+                yield number, line.replace(",", ".") if delimiter == ";" else line
 
 
 def _wrong_line(
-    file: BinaryIO, skipped: int, delimiter: str | None, used: Sequence[int], label: Sequence[bool]
+    path: Path, skipped: int, delimiter: str | None, used: Sequence[int], label: Sequence[bool]
 ) -> FormatError | None:
     """Return the error about the first line that is no row of the table."""
-    for number, line in _rows(file, skipped, delimiter):
+    for number, line in _rows(path, skipped, delimiter):
         cells = _cells(line.strip("\r\n"), delimiter)
         if len(cells) != len(label):
             return FormatError(f"line {number}", f"{len(cells)} columns", f"{len(label)}, as in the first line")

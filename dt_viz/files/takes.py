@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 
@@ -15,7 +13,7 @@ from dt_viz.files.archives import read_hdf5, read_json, read_mat, read_npy, read
 from dt_viz.files.bags import read_bag
 from dt_viz.files.checks import check_at_most, checked_suffix, real_numbers
 from dt_viz.files.columns import MAX_TURN, UNITS, Layout, expanded, is_kind, layout, numbered, role_of, unit_of, unnamed
-from dt_viz.files.tables import LIMITS, ReadOptions, Table, read_text
+from dt_viz.files.tables import LIMITS, ReadOptions, Table, at_sample, read_text
 
 UNTIMED = 5.0
 """Duration of a take without times or rate, seconds."""
@@ -41,16 +39,22 @@ class Take:
     joints: np.ndarray | None
     """(T, n), rad."""
     joint_names: tuple[str, ...]
-    place: Callable[[int], str]
-    """Describes the place of a sample in the file, for messages."""
     units: dict[str, float]
     """Sizes of the units of "length", "time" and "angle", as far as the file says."""
     is_timed: bool = True
     """Whether the file has its times or its rate."""
+    place: Callable[[int], str] = at_sample
+    """Describes the place of a sample in the file, for messages."""
+
+    @property
+    def values(self) -> np.ndarray:
+        """Places (T, d) or joint angles (T, n)."""
+        values = self.joints if self.positions is None else self.positions
+        return np.empty((0, 3)) if values is None else values
 
 
 Rows = slice | np.ndarray
-Reader = Callable[[BinaryIO, Path, ReadOptions], Iterator[Table]]
+Reader = Callable[[Path, ReadOptions], Iterator[Table]]
 TEXT = "text in UTF-8: a header with t, x, y and perhaps z, and a line of numbers for each sample"
 BAG = "a bag with poses, transforms or joint states"
 READERS: Mapping[str, tuple[Reader, str]] = {
@@ -72,12 +76,11 @@ READERS: Mapping[str, tuple[Reader, str]] = {
 """Reader of each kind of file, and what such a file is accepted as."""
 
 
-def read_takes(content: bytes | BinaryIO, source: Path, options: ReadOptions) -> tuple[list[Take], tuple[str, ...]]:
+def read_takes(path: Path, options: ReadOptions) -> tuple[list[Take], tuple[str, ...]]:
     """Read the takes of a file, in its units; `in_si_units` changes these over all files.
 
     Args:
-        content: all bytes of the file, or the file.
-        source: its name or path; the suffix says what it is, the stem names takes that have no name.
+        path: of the file; its suffix says what it is, the stem names takes that have no name.
         options: what is known beside the file.
 
     Returns:
@@ -87,10 +90,8 @@ def read_takes(content: bytes | BinaryIO, source: Path, options: ReadOptions) ->
         FormatError: it is none of `READERS`, too large, or there are no takes in it.
         Exception: of almost any kind, on hostile bytes.
     """
-    file = io.BytesIO(content) if isinstance(content, bytes) else content
-    suffix = checked_suffix(file.seek(0, io.SEEK_END), source, READERS, LIMITS.bytes)
-    file.seek(0)
-    return takes_of(READERS[suffix][0](file, source, options), options)
+    suffix = checked_suffix(path.stat().st_size, path, READERS, LIMITS.bytes)
+    return takes_of(READERS[suffix][0](path, options), options)
 
 
 def takes_of(tables: Iterable[Table], options: ReadOptions) -> tuple[list[Take], tuple[str, ...]]:
@@ -150,9 +151,9 @@ def _split(table: Table, options: ReadOptions, notes: dict[str, None]) -> Iterat
         seconds = seconds[rows] if len(seconds) == length else seconds
         place = _placing(table.place, rows)
         if found.positions:
-            yield Take(name, seconds, values, turns, None, (), place, units, is_timed)
+            yield Take(name, seconds, values, turns, None, (), units, is_timed, place)
         else:
-            yield Take(name, seconds, None, None, values, found.joint_names, place, units, is_timed)
+            yield Take(name, seconds, None, None, values, found.joint_names, units, is_timed, place)
 
 
 def _named_columns(table: Table, options: ReadOptions) -> dict[str, np.ndarray]:
@@ -163,13 +164,11 @@ def _named_columns(table: Table, options: ReadOptions) -> dict[str, np.ndarray]:
             columns |= expanded(name, values)
             continue
         rated = options.rate is not None or any(is_kind(other, "time") for other in table.columns)
-        names = options.names or (
-            numbered(values.shape[1])
-            if options.roles
-            else unnamed(values, options.num_joints, rated=rated, timed=False)
-        )
-        if len(names) != values.shape[1]:
-            raise FormatError("columns", f"{len(names)} names for {values.shape[1]} columns", "a name for each")
+        how = {"rated": rated, "timed": table.is_text, "asks": options.asks}
+        width = values.shape[1]
+        names = options.names or (numbered(width) if options.roles else unnamed(values, options.num_joints, **how))
+        if len(names) != width:
+            raise FormatError("columns", f"{len(names)} names for {width} columns", "a name for each")
         columns |= {name: values[:, k] for k, name in enumerate(names)}
     lower, taken = {name.lower(): name for name in columns}, {name.lower() for name in options.roles.values()}
     if missing := [name for name in options.roles.values() if name.lower() not in lower]:

@@ -3,95 +3,97 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import tempfile
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from types import MappingProxyType
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
 from dt_viz.errors import Cancelled, FormatError, end_if, never
 from dt_viz.files import worker
-from dt_viz.files.processes import start_module
+from dt_viz.files.processes import end_session, start_module
+from dt_viz.files.values import unpacked
 
-Read = tuple[list[np.ndarray], tuple[str, ...]]
-"""Arrays of a file, and notes about it for the page."""
+T = TypeVar("T")
 START = 60.0
 """Longest time until a process is ready for a file, seconds; a busy machine takes ten to import what it needs."""
 PATIENCE = 20.0
 """Longest time for a file from then on, seconds."""
 
 
+def _ended(code: object) -> FormatError:
+    return FormatError("file", f"something that ended its reader ({code})", "a whole file")
+
+
 class _Process:
-    """A process of `dt_viz.files.worker`, which may read one file."""
+    """A process of `dt_viz.files.worker`, which reads the files of one request at a time."""
 
     def __init__(self) -> None:
-        self._folder = tempfile.TemporaryDirectory(prefix="dt-viz-")  # what a process leaves that is ended goes with it
-        self._answer = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `end`; a pipe could be filled without end
-        self._process = start_module(
-            worker.__name__, output=self._answer, given=subprocess.PIPE, temporary=self._folder.name
-        )
+        self._temporary = tempfile.TemporaryDirectory(prefix="dt-viz-")  # what is left by what is ended goes with it
+        self._folder = Path(self._temporary.name)
+        self._said = self._folder / "said"
+        with self._said.open("wb") as said:  # a pipe could be filled without end
+            self._process = start_module(
+                worker.__name__, output=said, given=subprocess.PIPE, temporary=self._temporary.name
+            )
+        self._num_lines = 1
+        self.is_idle = True
+        """Whether it has read everything it was given."""
 
     @property
     def has_ended(self) -> bool:
         """Whether it has ended by itself."""
         return self._process.poll() is not None
 
-    def read(self, request: Sequence[bytes], cancelled: Cancelled) -> Read:
-        """Have a file read, and end. Raises as `read_upload`."""
-        giving = threading.Thread(target=self._give, args=(request,), name="upload", daemon=True)
-        giving.start()
-        try:
-            self._wait(cancelled)
-            self._answer.seek(1)  # behind the line that says that it is ready
-            line = self._answer.readline(2**16)
-            if self._process.returncode or not line:
-                found = f"something that ended its reader ({self._process.returncode})"
-                raise FormatError("file", found, "a whole file")
-            first = json.loads(line)
-            if "refused" in first:
-                field, found, accepted = map(str, first["refused"])
-                raise FormatError(field, found, accepted)
-            size, arrays = os.fstat(self._answer.fileno()).st_size, []
-            while self._answer.tell() < size:
-                arrays.append(np.load(self._answer, allow_pickle=False))
-            return arrays, tuple(map(str, first["notes"]))
-        finally:
-            self.end()
-            giving.join()
-
-    def _give(self, request: Sequence[bytes]) -> None:
+    def read(self, kind: type[T], request: Sequence[bytes], cancelled: Cancelled) -> T:
+        """Have files read. Raises as `read_upload`."""
+        self.is_idle = False
+        paths = [self._folder / name for name in (worker.REQUEST, worker.ANSWER)]
+        with paths[0].open("wb") as file:
+            file.writelines(request)
+        self._line(START, cancelled)
         assert self._process.stdin is not None
-        with suppress(OSError), self._process.stdin as pipe:  # it may have ended
-            pipe.writelines(request)
+        with suppress(OSError):  # it may have ended
+            self._process.stdin.write(b"\n")
+            self._process.stdin.flush()
+        self._num_lines += 1
+        code = self._line(PATIENCE, cancelled)
+        if code != "0":
+            raise _ended(code)
+        self.is_idle = True
+        try:
+            with paths[1].open("rb") as file:
+                first = json.loads(file.readline(2**22))
+                if "refused" in first:
+                    field, found, accepted = map(str, first["refused"])
+                    raise FormatError(field, found, accepted)
+                arrays = {str(name): np.load(file, allow_pickle=False) for name in first["arrays"]}
+        finally:
+            for path in paths:
+                path.unlink()
+        return unpacked(first["value"], kind, "file", arrays)
 
-    def _wait(self, cancelled: Cancelled) -> None:
-        deadline, ready = time.monotonic() + START, False
-        while True:
-            if not ready and os.fstat(self._answer.fileno()).st_size:
-                deadline, ready = time.monotonic() + PATIENCE, True
-            with suppress(subprocess.TimeoutExpired):
-                self._process.wait(timeout=0.1)  # seconds until it may be unwanted
-                return
+    def _line(self, patience: float, cancelled: Cancelled) -> str:
+        """Wait for the newest line that it has to say: one when it is ready, then a code for each request."""
+        deadline = time.monotonic() + patience
+        while len(lines := self._said.read_text().splitlines()) < self._num_lines:
+            if self.has_ended:
+                raise _ended(self._process.returncode)
             end_if(cancelled)
             if time.monotonic() > deadline:
-                found = f"data that take more than {PATIENCE:.0f} s to read"
-                raise FormatError("file", found, "a simpler file")
+                raise FormatError("file", f"data that take more than {patience:.0f} s to read", "a simpler file")
+            time.sleep(0.02)  # until it may be unwanted
+        return lines[-1]
 
     def end(self) -> None:
-        """End the process, whatever it does."""
-        self._process.kill()
-        self._process.wait()
-        assert self._process.stdin is not None
-        with suppress(OSError):  # what it has not taken
-            self._process.stdin.close()
-        self._answer.close()
-        self._folder.cleanup()
+        """End the process, and the one that reads for it, whatever they do."""
+        end_session(self._process)
+        self._temporary.cleanup()
 
 
 class _Ready:
@@ -111,11 +113,13 @@ class _Ready:
             process = None
         return process or _Process()
 
-    def renew(self) -> None:
-        """Start the next process."""
+    def renew(self, process: _Process | None = None) -> None:
+        """Have a process wait for the next file: this one if it can, or a new one."""
         with self._lock:
             if self._users and self._process is None:
-                self._process = _Process()
+                self._process = process if process is not None and process.is_idle else _Process()
+            if process is not None and self._process is not process:
+                process.end()
 
     def set_user(self, user: object, *, present: bool) -> None:
         """Add or remove somebody who may send files; end the process with the last one."""
@@ -130,34 +134,33 @@ _ready = _Ready()
 
 
 def read_upload(
-    kind: str,
-    suffix: str,
-    content: bytes,
+    kind: type[T],
+    files: Sequence[tuple[str, bytes]],
     cancelled: Cancelled = never,
-    options: Mapping[str, Any] = MappingProxyType({}),
-) -> Read:
-    """Read a file in another process.
+    **options: Any,  # noqa: ANN401 - what JSON can hold
+) -> T:
+    """Read files in another process.
 
     Args:
-        kind: "mesh", "points" or "takes".
-        suffix: the format, in lower case, such as ".stl".
-        content: all bytes of the file.
+        kind: class of what is read, one of `dt_viz.files.worker.READERS`.
+        files: name and content of each.
         cancelled: whether nobody wants it any more.
         options: further arguments of the reader.
 
     Returns:
-        Arrays of which nothing is known but that no object is in them: vertices and faces, or points and perhaps
-        labels; and notes for the page.
+        A value of that class, of its types; its arrays are finite, and of any shape.
 
     Raises:
-        FormatError: the file cannot be read, or not within the limits of memory and time.
+        FormatError: the files cannot be read, or not within the limits of memory and time.
         UnwantedError: nobody wants it any more.
         Exception: of almost any kind, if the process gave another answer.
     """
+    first = json.dumps([kind.__name__, [[name, len(content)] for name, content in files], options]).encode()
+    process = _ready.take()
     try:
-        return _ready.take().read((json.dumps([kind, suffix, dict(options)]).encode(), b"\n", content), cancelled)
+        return process.read(kind, [first, b"\n", *(content for _, content in files)], cancelled)
     finally:
-        _ready.renew()
+        _ready.renew(process)
 
 
 def make_ready() -> None:

@@ -1,32 +1,41 @@
-"""Process that reads one visitor's file within limits of memory, time and files, and ends.
+"""Process that reads visitors' files, each request in a process of its own with limits of memory, time and files.
 
-It imports what it needs, gives an empty line, and waits for a file, or ends without one when its standard input is
-closed. It takes a line of JSON, the kind, the suffix and options, and then the file. It gives a line of JSON,
-`{"notes": …}` or `{"refused": [field, found, accepted]}`, and then arrays as `numpy.save` writes them.
+It imports what it needs, gives an empty line, and waits for lines, until its standard input is closed. For each it has
+the file `request` of its temporary folder read: a line of JSON, what the files are, the name and size of each, and
+options, and then the files. The file `answer` is a line of JSON, `{"value": …, "arrays": [names]}` as
+`dt_viz.files.values.packed` makes it, or `{"refused": [field, found, accepted]}`, and then the arrays as `numpy.save`
+writes them. Then it gives a line, 0 or the code with which the reader has ended. Where processes cannot be forked, it
+reads itself.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import sys
+import tempfile
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from dt_viz.errors import FormatError
-from dt_viz.files.recordings import answer_recordings
-from dt_viz.files.shapes import read_mesh, read_points
+from dt_viz.files.recordings import Recordings, read_recordings
+from dt_viz.files.shapes import Points, Triangles, read_points, read_triangles
+from dt_viz.files.values import packed
 
+REQUEST, ANSWER = "request", "answer"
+"""Names of files in the temporary folder."""
 MEMORY = 2**30
 """Largest address space of the process, bytes."""
-KINDS: Mapping[str, Callable[..., tuple[tuple[np.ndarray, ...], tuple[str, ...]]]] = {
-    "mesh": read_mesh,
-    "points": read_points,
-    "takes": answer_recordings,
+READERS: Mapping[str, Callable[..., Any]] = {
+    Triangles.__name__: read_triangles,
+    Points.__name__: read_points,
+    Recordings.__name__: read_recordings,
 }
-"""Readers by what is asked for: they give arrays, and notes about them for the page."""
+"""Readers of names and contents, by the class of what they give."""
 
 
 def limit() -> None:
@@ -35,10 +44,9 @@ def limit() -> None:
         import resource  # noqa: PLC0415 - not on Windows
     except ImportError:
         return
-    used = resource.getrusage(resource.RUSAGE_SELF)
     limits = {
         "RLIMIT_AS": MEMORY,
-        "RLIMIT_CPU": 15 + int(used.ru_utime + used.ru_stime) + 1,  # seconds for the file
+        "RLIMIT_CPU": 15,  # seconds
         "RLIMIT_FSIZE": 10**8,  # bytes of an answer
         "RLIMIT_NOFILE": 32,  # open files
         "RLIMIT_CORE": 0,
@@ -48,33 +56,59 @@ def limit() -> None:
             resource.setrlimit(getattr(resource, name), (most, most))
 
 
-def answer(kind: str, suffix: str, content: bytes, **options: Any) -> tuple[dict[str, object], tuple[np.ndarray, ...]]:  # noqa: ANN401
-    """Read a file; return the first line of the answer and the arrays."""
+def answer(kind: str, files: list[tuple[str, bytes]], **options: Any) -> tuple[dict[str, Any], list[np.ndarray]]:  # noqa: ANN401
+    """Read files, each a name and its content; return the first line of the answer and the arrays."""
+    arrays: dict[str, np.ndarray] = {}
     try:
-        arrays, notes = KINDS[kind](content, suffix, **options)
+        value = packed(READERS[kind](files, **options), "file", arrays)
     except FormatError as error:
-        return {"refused": [error.field, error.found, error.accepted]}, ()
+        return {"refused": [error.field, error.found, error.accepted]}, []
     except MemoryError:
-        return {"refused": ["file", f"data that need more than {MEMORY / 1e9:.0f} GB to read", "a smaller file"]}, ()
+        return {"refused": ["file", f"data that need more than {MEMORY / 1e9:.0f} GB to read", "a smaller file"]}, []
     except Exception as error:  # no reader lists what corrupt bytes make it raise
         reason = " ".join(str(error).split())[:200] or type(error).__name__
-        return {"refused": ["file", f"something that cannot be read ({reason})", f"a {suffix} file"]}, ()
-    return {"notes": notes}, arrays
+        return {
+            "refused": ["file", f"something that cannot be read ({reason})", f"a {Path(files[0][0]).suffix} file"]
+        }, []
+    return {"value": value, "arrays": [*arrays]}, [*arrays.values()]
+
+
+def respond() -> None:
+    """Read the request, and write the answer."""
+    limit()
+    folder = Path(tempfile.gettempdir())
+    with (folder / REQUEST).open("rb") as file:
+        kind, sizes, options = json.loads(file.readline())
+        files = [(name, file.read(size)) for name, size in sizes]
+    with np.errstate(all="ignore"):
+        first, arrays = answer(kind, files, **options)
+    with (folder / ANSWER).open("wb") as file:
+        file.write(json.dumps(first).encode() + b"\n")
+        for array in arrays:
+            np.save(file, array, allow_pickle=False)
+
+
+def forked(work: Callable[[], None]) -> int:
+    """Do something in a process of its own, which ends with it; return its exit code."""
+    if not hasattr(os, "fork"):
+        work()
+        return 0
+    if process := os.fork():
+        return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
+    code = 1
+    try:
+        os.dup2(2, 1)  # what readers print is no code
+        work()
+        code = 0
+    finally:
+        os._exit(code)
 
 
 def main() -> None:
-    """Read one file from the standard input."""
+    """Read requests until there are no more."""
     print(flush=True)
-    line = sys.stdin.buffer.readline()
-    if not line:
-        return
-    limit()
-    kind, suffix, options = json.loads(line)
-    with np.errstate(all="ignore"):
-        first, arrays = answer(kind, suffix, sys.stdin.buffer.read(), **options)
-    sys.stdout.buffer.write(json.dumps(first).encode() + b"\n")
-    for array in arrays:
-        np.save(sys.stdout.buffer, array, allow_pickle=False)
+    while sys.stdin.readline():
+        print(forked(respond), flush=True)
 
 
 if __name__ == "__main__":

@@ -99,7 +99,6 @@ class Shear(Diffeomorphism):
 
     @property
     def dim(self) -> int:
-        """Dimension of the state."""
         return self.predictions.dim + 1 + self.predictions.num_conditions
 
     def scaled(self, fraction: float) -> Shear:
@@ -153,7 +152,6 @@ class OnPlaces(Diffeomorphism):
 
     @property
     def dim(self) -> int:
-        """Dimension of the state."""
         return self.transform.dim + self.num_rest
 
     def scaled(self, fraction: float) -> OnPlaces:
@@ -214,7 +212,6 @@ class PhasedAttractor(Attractor):
         return moved
 
     def flow(self, z0: Array, times: Array) -> Array:
-        """Compute z(t), (*B, T, d + 1 + c), from `z0` (*B, d + 1 + c) at `times` (T,) or (*B, T), s, in closed form."""
         # from phase 0 all fades as it does near phase 0, where s runs down exponentially
         start = np.maximum(self.left(z0), np.finfo(float).tiny ** 0.5)[..., None]
         when = np.broadcast_to(times, (*z0.shape[:-1], np.shape(times)[-1]))
@@ -222,7 +219,6 @@ class PhasedAttractor(Attractor):
         return self.at_fraction(z0, left / start)
 
     def at_fraction(self, z0: Array, fraction: Array) -> Array:
-        """Compute points (*B, T, d + 1 + c) of motions from `z0` (*B, d + 1 + c) where s/s₀ is `fraction` (*B, T)."""
         d = self.predictions.dim
         z = np.broadcast_to(
             z0[..., None, :],
@@ -234,17 +230,14 @@ class PhasedAttractor(Attractor):
         return z
 
     def times_at(self, z0: Array, distances: Array) -> Array:
-        """Compute when, (*B, T), s, the phases of motions from `z0` (*B, d + 1 + c) are `distances` (*B, T), metres."""
         return self._by_clock(
             z0, lambda clock, s, phases: clock.times_at(s, phases), self.left(z0)[..., None], distances
         )
 
     def frozen(self, rest: Array, slope: Array) -> Frozen:
-        """The base system of places at one phase and for one condition.
+        """The base system of places at one phase, metres, and for one condition, `rest` (1 + c,).
 
-        Args:
-            rest: (1 + c,) phase, metres, and condition.
-            slope: (d,) derivative of the curve that the places are relative to, there.
+        The curve that the places are relative to has the derivative `slope` (d,) there.
         """
         d = self.predictions.dim
         state = np.concatenate([self.goal[:d], rest])
@@ -301,7 +294,6 @@ class Frozen(Attractor):
         return self.moving.potential_at(np.hypot(distance, self.rest[0]))
 
     def velocity(self, z: Array) -> Array:
-        """Compute ẋ (*B, d), m/s."""
         return -self.gain * (z - self.goal)
 
 

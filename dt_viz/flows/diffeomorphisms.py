@@ -36,8 +36,7 @@ class Diffeomorphism(ABC):
     def scaled(self, fraction: float) -> Diffeomorphism:
         """The transform between the identity (fraction 0) and ψ (1): each flow runs for a fraction of its duration.
 
-        A flow becomes γ(fraction·t, ·), so scaled(a)∘scaled(b) = scaled(a + b). A chain becomes the chain of its scaled
-        parts.
+        A flow becomes γ(fraction·t, ·), so scaled(a)∘scaled(b) = scaled(a + b), and a chain that of its scaled parts.
         """
 
     def forward(self, y: Array) -> Array:
@@ -224,7 +223,6 @@ class Placed(Diffeomorphism):
 
     @property
     def dim(self) -> int:
-        """Dimension d of the space that it is placed in."""
         return len(self.origin)
 
     def to_world(self, u: Array) -> Array:
@@ -236,7 +234,6 @@ class Placed(Diffeomorphism):
         return (y - self.origin) @ self.axes / self.scale
 
     def scaled(self, fraction: float) -> Placed:
-        """Frame and scale stay."""
         return replace(self, inner=self.inner.scaled(fraction))
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:

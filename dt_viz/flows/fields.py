@@ -38,11 +38,7 @@ class CompiledField(ABC):
 
     @abstractmethod
     def carried(self, s: Array, method: int, duration: float = 0.0, steps: int = 1, tolerance: float = 0.0) -> Array:
-        """Carry points `s` (N, d) along by an explicit method; see `dt_viz.kernels.flows.carry`.
-
-        Raises:
-            ArithmeticError: some point needs more adaptive steps than `steps`.
-        """
+        """Carry points `s` (N, d) along by an explicit method; see `dt_viz.flows.integrators.carried`."""
 
 
 class PointField(ABC):
@@ -104,13 +100,10 @@ class GaussianGrid:
 
     @classmethod
     def covering(cls, points: ArrayLike, sigma: float, *, spacing: float = 1.0, pad: float = 1.0) -> GaussianGrid:
-        """Grid of Gaussians of width `sigma` over the bounding box of `points`.
+        """Grid of Gaussians of width `sigma`, in the unit of the points (N, d), over the box of these.
 
-        Args:
-            points: (N, d) points to cover.
-            sigma: width σ of a Gaussian, in the unit of the points.
-            spacing: largest distance between neighbouring inducing points, in σ.
-            pad: margin around the points, in σ.
+        The largest distance between neighbouring inducing points, `spacing`, and the margin around the points, `pad`,
+        are in σ.
         """
         points = np.asarray(points, dtype=float)
         lower, upper = points.min(axis=0) - pad * sigma, points.max(axis=0) + pad * sigma
@@ -139,15 +132,7 @@ class GaussianGrid:
         return np.stack(np.meshgrid(*self.axes, indexing="ij"), axis=-1).reshape(-1, self.dim)
 
     def factors(self, s: Array, max_order: int = 0) -> list[Array]:
-        """1-D Gaussians of each axis and their derivatives.
-
-        Args:
-            s: (N, d) points.
-            max_order: K, the highest derivative.
-
-        Returns:
-            For each axis j an array (K + 1, N, n_j), the derivative's order first.
-        """
+        """1-D Gaussians of points `s` (N, d) and their derivatives up to the order K: for each axis (K + 1, N, n_j)."""
         factors = []
         for coordinate, nodes in zip(s.T, self.axes, strict=True):
             offset = coordinate[:, None] - nodes
@@ -195,7 +180,6 @@ class GridRBF(PointField):
 
     @property
     def dim(self) -> int:
-        """Dimension d of the space."""
         return self.grid.dim
 
     def _terms(self) -> Terms:
@@ -219,7 +203,6 @@ class PlacedField(PointField):
 
     @property
     def dim(self) -> int:
-        """Dimension d of the space."""
         return self.inner.dim
 
     @cached_property
@@ -248,7 +231,6 @@ class Projected(PointField):
 
     @property
     def dim(self) -> int:
-        """Dimension d of the space."""
         return self.inner.dim
 
     def _terms(self) -> Terms:
@@ -265,7 +247,6 @@ class Sum(PointField):
 
     @property
     def dim(self) -> int:
-        """Dimension d of the space."""
         return self.parts[0].dim
 
     def _terms(self) -> Terms:

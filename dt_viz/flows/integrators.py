@@ -31,7 +31,7 @@ def carried(
     steps: int = 1,
     tolerance: float = 0.0,
 ) -> tuple[Array, Array | None]:
-    """Carry points `s` (N, d) and tangents `U` (N, d, k) along the flow of a field.
+    """Carry points `s` (N, d) and tangents `U` (N, d, k) along the flow of a field, for a duration of either sign.
 
     Compiled fields have loops of their own. Of others, tangents are carried by the differences, of fourth order, of
     points beside `s`.
@@ -42,13 +42,10 @@ def carried(
         U: tangents, or None.
         method: `EULER`, the paper's, of first order; `RK4`, of fourth; `IMPLICIT_EULER`, of first, the exact inverse of
             Euler's, for a `PointField` only; or `DORMAND_PRINCE`, adaptive steps of each point by itself.
-        duration: of the flow, of either sign.
-        steps: number of equal steps, or largest number of adaptive ones.
+        duration: of the flow.
+        steps: number of equal steps, or largest number of adaptive ones; more raise ArithmeticError.
         tolerance: largest estimated error of an adaptive step, in the unit of `s`; smaller in proportion where the
             motion is short. That of tangents is `dt_viz.kernels.dormand_prince.TANGENT_TOLERANCE`.
-
-    Raises:
-        ArithmeticError: some point needs more adaptive steps than `steps`.
     """
     if isinstance(field, PointField):
         return field.carried(s, U, method, duration, steps, tolerance)

@@ -42,8 +42,7 @@ class Rays:
     def times(self, index: Indices, fraction: Array) -> Array:
         """Times (N,), seconds, at which the motions are at the points that `at` gives; `index` must not decrease.
 
-        The goal counts as reached at the distance `ARRIVED`, or at a smaller one where other samples are nearer: no two
-        samples share a time.
+        The goal counts as reached at the distance `ARRIVED`, or nearer, so that no two samples share a time.
         """
         radius = self.base.left(self.z0)
         left = (1 - fraction) * radius[index]
@@ -87,12 +86,9 @@ Evaluate = Callable[[Indices, Array], Array]
 
 
 def evenly_sampled(evaluate: Evaluate, num_rollouts: int, num_samples: int) -> Bundle:
-    """Sample rollouts at even distances along their paths, start and goal included; one that rests at even fractions.
+    """Sample R rollouts at even distances along their paths, ends included; one that rests at even fractions.
 
-    Args:
-        evaluate: gives the levels of samples.
-        num_rollouts: number of rollouts R.
-        num_samples: number of samples of each rollout.
+    `evaluate` gives the levels of samples; there are `num_samples` of each rollout.
     """
     trial = np.linspace(0, 1, 2 * num_samples)
     index = np.repeat(np.arange(num_rollouts), len(trial))
@@ -107,19 +103,11 @@ def evenly_sampled(evaluate: Evaluate, num_rollouts: int, num_samples: int) -> B
 
 
 def refined(bundle: Bundle, evaluate: Evaluate, spacing: float, *, max_rounds: int = 12) -> Bundle:
-    """Insert samples until neighbours are at most `spacing` apart.
+    """Insert samples into rollouts until neighbours are at most `spacing` apart, metres.
 
     Close to an obstacle's centre ψ⁻¹ stretches a path a hundredfold; without refinement a drawn segment cuts through
-    the obstacle that the motion avoids.
-
-    Args:
-        bundle: rollouts to refine.
-        evaluate: gives the levels of samples.
-        spacing: largest distance of neighbours, metres.
-        max_rounds: largest number of rounds of insertion.
-
-    Returns:
-        The refined bundle. Wider gaps remain after `max_rounds`, and where it has `MAX_SAMPLES` samples.
+    the obstacle that the motion avoids. `evaluate` gives the levels of samples. Wider gaps remain after `max_rounds` of
+    insertion, and where there are `MAX_SAMPLES`.
     """
     for _ in range(max_rounds):
         same = np.diff(bundle.index) == 0

@@ -33,12 +33,9 @@ class Attractor:
         return len(self.goal)
 
     def states(self, places: Array, label: float | None = None, like: Array | None = None) -> Array:
-        """The states (*B, d) in which motions from places (*B, d) begin: the places themselves.
+        """The states (*B, d) in which motions from places (*B, d), metres, begin: the places themselves.
 
-        Args:
-            places: metres.
-            label: of the motions, in a system that tells them apart by labels.
-            like: (d,) where in base space a motion is whose label these have, instead.
+        A system that tells motions apart takes their label, or that of a motion in base space, `like` (d,).
 
         Raises:
             FormatError: no demonstration has such a label.
@@ -117,8 +114,7 @@ class Attractor:
 class DiffeomorphicSystem:
     """The natural gradient system ẏ = J(y)⁻¹·f(ψ(y)), f the base attractor (eq. (1) in exact form).
 
-    ψ is a conjugacy: z = ψ(y) obeys ż = f(z) exactly. So the system is as stable as its base and its motions are
-    images of the base's motions.
+    ψ is a conjugacy: z = ψ(y) obeys ż = f(z) exactly, so it is as stable as its base, whose motions are mapped to its.
     """
 
     transform: Diffeomorphism

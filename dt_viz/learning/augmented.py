@@ -14,31 +14,37 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from numbers import Real
-from typing import ClassVar
+from typing import ClassVar, TypeVar
 
 import numpy as np
 
 from dt_viz.errors import FormatError
 from dt_viz.flows.augmented_systems import PhaseCurve, PhasedAttractor, Shear
 from dt_viz.flows.fields import Array, Indices
-from dt_viz.flows.rotations import turned
+from dt_viz.flows.rotations import exponential, nearest, turned
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem, asinh_exp, log_sinh
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.grouping import patterns_of, set_apart, told_by_starts
 from dt_viz.learning.initial_guess import groups_of
 from dt_viz.learning.interface import AnyImitation, State
 from dt_viz.learning.patterns import AugmentedSettings, Pattern, learn_patterns
-from dt_viz.learning.poses import Poses, latest
 from dt_viz.learning.preparation import ImitationError, Motions, prepare
 from dt_viz.learning.timing import ARRIVED, TimedAttractor
 from dt_viz.metrics import arc_length
 
+_T = TypeVar("_T")
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AugmentedImitation(AnyImitation):
-    """A learned motion in the augmented state, for any start: what `dt_viz.flows.augmented_systems.Predictions` are."""
+    """A learned motion in the augmented state, for any start: what `dt_viz.flows.augmented_systems.Predictions` are.
+
+    Its states have places y, or (`poses`) poses (y, r) of the hand: the place, and the rotation vector at the goal's
+    orientation times the length that a radian counts, metres. The shear takes the predicted motion of both away, so
+    that what pushes the hand, or turns it, dies away along one stable system.
+    """
 
     state: ClassVar[State] = "augmented"
     top: float
@@ -52,28 +58,27 @@ class AugmentedImitation(AnyImitation):
     """Clock of the phase, without the pace that is predicted for a start."""
     radius: float = 0.0
     """Length that a turn of the hand by one radian counts, metres."""
-    goal_orientation: Array | None = None
-    """(4,) orientation of the hand at the goal, wxyz; None of motions without orientations."""
+    posed: bool = False
+    """Whether the states are those of poses."""
 
     @property
     def dim(self) -> int:
-        """Dimension d of the places."""
-        return len(self.goal)
+        """Dimension of the places, d, or of the poses, d + 3."""
+        return len(self.goal) + 3 * self.posed
+
+    @cached_property
+    def poses(self) -> AugmentedImitation | None:
+        """The motions of the hand's pose, whose places are these; None of motions without orientations."""
+        return None if self.goal_orientation is None else replace(self, posed=True)
 
     @property
     def known_labels(self) -> tuple[float, ...]:
-        """Different labels, increasing; none where starts tell what follows."""
         return tuple(sorted(pattern.label for pattern in self.patterns if pattern.label is not None))
-
-    @property
-    def has_orientation(self) -> bool:
-        """Whether the hand's orientation was learned, too."""
-        return self.goal_orientation is not None
 
     @property
     def num_conditions(self) -> int:
         """Number of coordinates of a condition: those of the start, and the index of the pattern."""
-        return self.dim + 1
+        return len(self.goal) + 1
 
     @property
     def base(self) -> PhasedAttractor:
@@ -92,75 +97,78 @@ class AugmentedImitation(AnyImitation):
         return DiffeomorphicSystem(Shear(self), self.base)
 
     def system_in(self, origin: Array, axes: Array, scale: float) -> DiffeomorphicSystem:
-        return self.placed(origin, axes[:, : self.dim], scale).system
+        return self.placed(origin, axes[:, : len(self.goal)], scale).system
 
     def states(self, places: Array, label: float | None = None) -> Array:
-        """The states (*B, d + 1 + c) in which motions from places (*B, d), metres, begin.
+        """The states (*B, dim + 1 + c) in which motions from places or poses (*B, dim), metres, begin.
 
-        Args:
-            places: metres.
-            label: of the motions; None takes the pattern of the demonstrated start which is nearest to each.
+        The label is that of the motions; None takes the pattern of the demonstrated start which is nearest to each.
 
         Raises:
             FormatError: no demonstration has such a label.
         """
-        top = np.full((*places.shape[:-1], 1), self.top)
+        top, starts = np.full((*places.shape[:-1], 1), self.top), places[..., : len(self.goal)]
         if label is None:
-            nearest = np.linalg.norm(places[..., None, :] - self.starts, axis=-1).argmin(axis=-1)
-            pattern = self.pattern_of[nearest][..., None]
+            closest = np.linalg.norm(starts[..., None, :] - self.starts, axis=-1).argmin(axis=-1)
+            pattern = self.pattern_of[closest][..., None]
         else:
             known = [pattern.label for pattern in self.patterns]
             if label not in known:
                 raise unknown_label(label, self.known_labels)
             pattern = np.full_like(top, known.index(label))
-        return np.concatenate([places, top, places, pattern], axis=-1)
+        return np.concatenate([places, top, starts, pattern], axis=-1)
 
     def demonstrated(self, starts: Array) -> Array:
-        """The states (R, d + 1 + c) in which the motions of all demonstrations begin, from their starts (R, d)."""
+        """The states (R, dim + 1 + c) in which the motions of all demonstrations begin, from their starts (R, dim)."""
         states = self.states(starts)
         states[list(self.numbers), -1] = self.pattern_of
         return states
 
     def caught(self, state: Array) -> float:
-        """The phase, metres, at which a motion goes on that was pushed to a `state` (d + 1 + c,).
+        """The phase, metres, at which a motion goes on that was pushed to a `state` (dim + 1 + c,).
 
         It is the one, not far from that of the state, at which the predicted motion is nearest: so what it has not
-        drawn yet is drawn.
+        drawn yet is drawn. A turn of the hand does not change it.
         """
-        place, phase, condition = state[: self.dim], state[self.dim], state[self.dim + 1 :]
+        d, phase, condition = len(self.goal), state[self.dim], state[self.dim + 1 :]
         reach = self.augmented.caught_within * self.top
         first, last = np.clip((phase - reach, phase + reach), self.augmented.caught_above * self.top, self.top)
         phases = np.linspace(first, last, 61)
-        away = np.linalg.norm(self.curve(condition).at(phases) - place, axis=1)
+        away = np.linalg.norm(self.curve(condition).at(phases)[:, :d] - state[:d], axis=1)
         return float(phases[away.argmin()])
 
     def curve(self, condition: Array) -> PhaseCurve:
-        """The motion (d,), metres, that is predicted for a condition (c,), over the phase."""
+        """The motion (dim,), metres, that is predicted for a condition (c,), over the phase."""
         return self._curves(condition.tobytes())
 
-    @cached_property
-    def poses(self) -> Poses | None:
-        """The motions of the hand's pose; None of motions without orientations."""
-        return None if self.goal_orientation is None else Poses(self, self.goal_orientation)
-
     def sensitivity(self, condition: Array) -> PhaseCurve:
-        """Its derivative (d, c) with respect to the condition; that with respect to the pattern is 0."""
-        pattern = self.pattern(condition)
-        slopes = pattern.slopes(condition[: self.dim])
+        """Its derivative (dim, c) with respect to the condition; that with respect to the pattern is 0."""
+        pattern, start = self.pattern(condition), condition[:-1]
+        slopes = pattern.pose_slopes(start) if self.posed else pattern.slopes(start)
         return self.over_phase(np.concatenate([slopes, np.zeros_like(slopes[..., :1])], axis=-1))
 
     def clock(self, condition: Array) -> TimedAttractor:
         """The clock of the phase that is predicted for a condition (c,)."""
         return self._clocks(condition.tobytes())
 
-    def placed(self, origin: Array, axes: Array, scale: float) -> AugmentedImitation:
-        """The same motions in a space of more dimensions: a place y becomes origin + scale·axes·y.
+    def predicted(self, rest: Array) -> Array:
+        """Orientations (N, 4), wxyz, that are predicted for phases and conditions (N, 1 + c), of poses."""
+        still = np.zeros((len(rest), self.dim))  # poses in base space: nothing leads off the motion
+        return self.orientations(self.system.transform.inverse(np.hstack([still, rest]))[:, self.dim - 3 : self.dim])
 
-        Args:
-            origin: (D,), metres.
-            axes: (D, d) orthonormal columns.
-            scale: metres for one unit of y.
-        """
+    def orientations(self, turns: Array) -> Array:
+        """Orientations (*B, 4), wxyz, of the coordinates r (*B, 3) of poses."""
+        assert self.goal_orientation is not None
+        return exponential(self.goal_orientation, turns / self.radius)
+
+    def turns(self, orientations: Array, near: Array) -> Array:
+        """The coordinates r (N, 3) of orientations (N, 4), wxyz, of poses: of all of one, those nearest to `near`."""
+        assert self.goal_orientation is not None
+        pairs = zip(near / self.radius, orientations, strict=True)
+        return self.radius * np.stack([nearest(self.goal_orientation, turned, to) for to, turned in pairs])
+
+    def placed(self, origin: Array, axes: Array, scale: float) -> AugmentedImitation:
+        """The same motions in R^D, where a place y becomes origin + scale·axes·y, metres, axes (D, d) orthonormal."""
         return replace(
             self,
             starts=origin + scale * self.starts @ axes.T,
@@ -176,7 +184,8 @@ class AugmentedImitation(AnyImitation):
 
     @cached_property
     def _curves(self) -> Callable[[bytes], PhaseCurve]:
-        return latest(lambda condition: self.over_phase(self.pattern(condition).points(condition[: self.dim])))
+        points = Pattern.poses if self.posed else Pattern.points
+        return latest(lambda condition: self.over_phase(points(self.pattern(condition), condition[:-1])))
 
     @cached_property
     def _clocks(self) -> Callable[[bytes], TimedAttractor]:
@@ -191,7 +200,7 @@ class AugmentedImitation(AnyImitation):
         return PhaseCurve.through(self.top * np.linspace(0.0, 1.0, len(values)), values[::-1])
 
     def _clock(self, condition: Array) -> TimedAttractor:
-        pattern, start, slowest = self.pattern(condition), condition[: self.dim], self.augmented.min_pace
+        pattern, start, slowest = self.pattern(condition), condition[:-1], self.augmented.min_pace
         length, usual = (float(arc_length(points)[-1]) for points in (pattern.poses(start), pattern.mean_pose))
         length = max(length, self.augmented.min_length * usual)
         duration, *profile = pattern.timing.at(start)
@@ -215,14 +224,11 @@ def fit_augmented(
     settings: AugmentedSettings | None = None,
     reason: str = "",
 ) -> AugmentedImitation:
-    """Learn motions in the augmented state, with as few patterns as the demonstrations show.
+    """Learn motions to (about) the same goal in the augmented state, with as few patterns as they show.
 
-    Args:
-        demonstrations: at least one, all ending at (about) the same place.
-        labels: a number for each demonstration; those with one number are of one pattern. None tells patterns apart,
-            and labels them where their starts do not: evenly, 2 apart, around 0, in the order in which they come.
-        settings: None takes the defaults.
-        reason: see `AnyImitation`.
+    Labels are a number for each demonstration; those with one number are of one pattern. None tells patterns apart, and
+    labels them where their starts do not: evenly, 2 apart, around 0, in the order in which they come. For the reason,
+    see `AnyImitation`.
 
     Raises:
         ImitationError: nothing can be learned from these demonstrations, or there are not as many labels.
@@ -243,6 +249,11 @@ def fit_augmented(
     if off > settings.max_missed:
         warnings = (*warnings, f"a motion misses its demonstration by {100 * off:.0f} % of the extent")
     return replace(imitation, labels=given, warnings=warnings, reason=reason, fit_seconds=time.perf_counter() - began)
+
+
+def latest(compute: Callable[[Array], _T]) -> Callable[[bytes], _T]:
+    """A function of a condition's bytes whose latest results are kept."""
+    return lru_cache(64)(lambda content: compute(np.frombuffer(content)))
 
 
 def unknown_label(label: float, known: tuple[float, ...]) -> FormatError:

@@ -4,21 +4,21 @@ They are saved as npz, seconds and metres, for i = 0, 1, 2, …: ``times_i`` (T,
 ``orientations_wxyz_i`` (T, 4) and ``name_i``, a string.
 """
 
-import io
 import logging
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from tempfile import TemporaryDirectory
+from typing import Any, Protocol
 
 import numpy as np
 
 from dt_viz.errors import DataError, FormatError, naming, parsing
 from dt_viz.files.checks import check_at_most, check_finite, real_numbers
-from dt_viz.files.folders import bag_folder, files_of, is_bag, is_lerobot, lerobot_folder
+from dt_viz.files.folders import accepted_as, files_of, parts_of, read_part
 from dt_viz.files.tables import ReadOptions, at_sample
-from dt_viz.files.takes import READERS, Take, in_si_units, read_takes
+from dt_viz.files.takes import READERS, Take, in_si_units
 from dt_viz.flows.rotations import turned
 
 logger = logging.getLogger(__name__)
@@ -92,16 +92,11 @@ def check_demonstrations(
 ) -> tuple[Demonstration, ...]:
     """Check recorded motions and bring them into the one form that the rest of the program trusts.
 
-    Every loader ends here; motions recorded in memory go through it as well.
+    Every loader ends here; motions recorded in memory, of any real number type and from any time on, do as well.
+    The source, a file or recording, is for messages, and so is, for each demonstration, what describes the place of a
+    sample in it; without `places`, samples are counted from 1.
 
-    Args:
-        demonstrations: times ``(T,)`` in seconds from any start, positions ``(T, d)`` in metres, any real number type.
-        source: the file or recording, for messages.
-        places: for each demonstration, what describes the place of a sample in the file, for messages;
-            without it, samples are counted from 1.
-
-    Returns:
-        The same motions with times from 0, as read-only float64 arrays.
+    Returns the same motions with times from 0, as read-only float64 arrays.
 
     Raises:
         DemonstrationError: there are none, or too many; they differ in dimension; or one of them has not the shapes,
@@ -140,13 +135,10 @@ def samples_of(
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return the times (T,) from 0 and the positions (T, d) of demonstrations as new float64 arrays.
 
-    Args:
-        demonstrations: recorded motions.
-        places: as in :func:`check_demonstrations`.
-
     Raises:
         FormatError: there are none, they differ in dimension, or one of them has not the shapes, the number of samples,
-            the finite values or the increasing times that :class:`Demonstration` promises.
+            the finite values or the increasing times that :class:`Demonstration` promises. It says where by `places`,
+            as :func:`check_demonstrations` does.
     """
     if not demonstrations:
         raise FormatError("demonstrations", "none", "at least one")
@@ -230,7 +222,7 @@ def load_demonstrations(
             package that is not installed, has columns that are not clear, or holds demonstrations that
             :func:`check_demonstrations` refuses; or there are times beside a rate, or joint angles without an arm.
     """
-    options = ReadOptions(rate, unit, columns, topic, () if arm is None else tuple(arm.joint_names))
+    options = ReadOptions(rate, unit, columns, topic, _joints(arm))
     sources = [Path(path)] if isinstance(path, str | Path) else [*map(Path, path)]
     found = [read for source in sources for read in _found_in(source, options)]
     return demonstrations_of(found, ", ".join(map(str, sources))[:200], arm)
@@ -240,25 +232,22 @@ def read_demonstrations(
     content: bytes,
     source: str | Path,
     *,
-    rate: float | None = None,
-    unit: str | None = None,
-    columns: str | Sequence[str] | Mapping[str, str] | None = None,
-    topic: str | None = None,
     arm: ForwardKinematics | None = None,
+    **options: Any,  # noqa: ANN401
 ) -> tuple[Demonstration, ...]:
-    """Read the demonstrations in the bytes of a file; arguments and errors as of :func:`load_demonstrations`.
+    """Read the demonstrations in all bytes of a file; options and errors as of :func:`load_demonstrations`.
 
-    Args:
-        content: all bytes of the file.
-        source: its name or path; the suffix says what it is, the stem names demonstrations that have no name.
-        rate: see there.
-        unit: see there.
-        columns: see there.
-        topic: see there.
-        arm: see there.
+    The suffix of the source, a name or path, says what it is; its stem names demonstrations that have no name.
     """
-    options = ReadOptions(rate, unit, columns, topic, () if arm is None else tuple(arm.joint_names))
-    return demonstrations_of([_read(io.BytesIO(content), Path(source), options)], source, arm)
+    wanted = ReadOptions(**options, joint_names=_joints(arm))
+    with TemporaryDirectory() as folder:
+        path = Path(folder, Path(source).name)
+        path.write_bytes(content)
+        return demonstrations_of([(Path(source), *_read(path, source, wanted)[1:])], source, arm)
+
+
+def _joints(arm: ForwardKinematics | None) -> tuple[str, ...]:
+    return () if arm is None else tuple(arm.joint_names)
 
 
 def demonstrations_of(
@@ -266,13 +255,8 @@ def demonstrations_of(
 ) -> tuple[Demonstration, ...]:
     """Make demonstrations of the takes of one or several files; log lines say what was recognised or is not used.
 
-    Args:
-        found: for each file its path, its takes and notes about them, as `read_takes` gives them.
-        source: the files or the folder, for messages.
-        arm: as for :func:`load_demonstrations`.
-
-    Raises:
-        DemonstrationError: as :func:`load_demonstrations`.
+    For each file its path, its takes and notes about them are given, as `read_takes` gives them; the source, all files
+    or their folder, is for messages. Raises as :func:`load_demonstrations`.
     """
     said: dict[str, list[Path]] = {}
     for path, _, notes in found:
@@ -311,24 +295,16 @@ def demonstrations_of(
 def _found_in(path: Path, options: ReadOptions) -> list[Found]:
     """Read a file, or the files of a folder."""
     with parsing(DemonstrationError, path, "path", "a readable file or folder"):
-        if not path.is_dir():
-            if not path.is_file():
-                raise FormatError("path", "no such file or folder", "a readable file or folder")
-            with path.open("rb") as file:
-                return [_read(file, path, options)]
-        if is_bag(path):
-            return [(path, *bag_folder(path, options))]
-        if is_lerobot(path):
-            return [(path, *lerobot_folder(path, options))]
-        if not (files := files_of(path)):
+        if not path.exists():
+            raise FormatError("path", "no such file or folder", "a readable file or folder")
+        if not (parts := parts_of(path)):
             raise FormatError("folder", "no file of recorded motions", f"files of the kinds {', '.join(READERS)}")
-    return [read for file in files for read in _found_in(file, options)]
+    return [_read(part, part, options) for part in parts]
 
 
-def _read(file: BinaryIO, source: Path, options: ReadOptions) -> Found:
-    accepted = READERS.get(source.suffix.lower(), (None, "a file of recorded motions"))[1]
-    with parsing(DemonstrationError, source, "file", accepted):
-        return (source, *read_takes(file, source, options))
+def _read(path: Path, source: str | Path, options: ReadOptions) -> Found:
+    with parsing(DemonstrationError, source, "file", accepted_as(path)):
+        return (path, *read_part(path, options))
 
 
 def _in_frame_of(take: Take, arm: ForwardKinematics | None) -> Take:
@@ -344,7 +320,7 @@ def _hand(take: Take, arm: ForwardKinematics | None) -> np.ndarray:
     """Positions (T, d) of the hand, metres, perhaps by an arm's kinematics."""
     q, names = take.joints, take.joint_names
     if take.positions is not None or q is None:
-        return np.empty((0, 3)) if take.positions is None else take.positions
+        return take.values
     found = f"angles of {q.shape[1]} joints ({', '.join(names)[:160]})"
     if arm is None:
         accepted = "places of the hand, x, y and perhaps z; or name the arm that turns angles into such: arm=…"
@@ -371,10 +347,7 @@ def save_demonstrations(path: str | Path, demonstrations: Sequence[Demonstration
 
 
 def lasa_files(folder: str | Path) -> dict[str, Path]:
-    """List the shapes of a LASA folder by name, without reading them: load one with :func:`load_demonstrations`.
-
-    Args:
-        folder: holds one ``.mat`` file per shape, such as ``Sshape.mat``.
+    """List the shapes of a LASA folder, one ``.mat`` file each, by name: load one with :func:`load_demonstrations`.
 
     Raises:
         DemonstrationError: there is no such folder, it cannot be read, or it holds no ``.mat`` file.

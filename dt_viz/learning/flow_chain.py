@@ -36,13 +36,10 @@ class FlowLayer:
 
     @classmethod
     def near(cls, points: Array, sigma: float, *, spacing: float, reach: float) -> FlowLayer:
-        """Make a layer of Gaussians of width `sigma` on a grid around `points` (N, d).
+        """Make a layer of Gaussians of width `sigma` around points (N, d) at which the field must be able to act.
 
-        Args:
-            points: places where the field must be able to act.
-            sigma: width of a Gaussian, in the unit of the points.
-            spacing: distance between neighbouring inducing points, in σ.
-            reach: distance from the points, in σ, beyond which inducing points are left out.
+        The distance between neighbouring inducing points, `spacing`, and that from the points beyond which they are
+        left out, `reach`, are in σ.
         """
         grid = GaussianGrid.covering(points, sigma, spacing=spacing, pad=reach)
         distance, _ = KDTree(points).query(grid.inducing_points)
@@ -131,11 +128,9 @@ class FlowChain:
         return z
 
     def images_with_sensitivity(self, z: Array, thetas: Sequence[Array]) -> tuple[Array, Array, Array]:
-        """Compute the images of points `z` (N, d) and their derivatives.
+        """Compute images (N, d) of points `z` (N, d), their derivative by z (N, d, d), and by P unknowns (N, d, P).
 
-        Returns:
-            The images (N, d), their derivative by z (N, d, d), and that by the unknowns (N, d, P), ordered as in
-            `join`: the sum over steps of (product of the later steps' Jacobians)·h·Φ(s).
+        That, ordered as in `join`, is the sum over steps of (product of the later steps' Jacobians)·h·Φ(s).
         """
         h, d = 1.0 / self.steps, self.dim
         path: list[tuple[Array, Array]] = []  # step by step: raw Gaussians, Jacobian of the step

@@ -9,14 +9,9 @@ from dt_viz.learning.initial_guess import groups_of
 
 
 def patterns_of(points: Array, num: int) -> Indices:
-    """Tell motions apart by their shapes, wherever they begin.
+    """Tell motions (R, n, d), evenly sampled along each, apart by their shapes, wherever they begin.
 
-    Args:
-        points: (R, n, d) of them, evenly along each.
-        num: largest number of patterns.
-
-    Returns:
-        (R,) index of the pattern of each, in the order in which patterns come first.
+    Returns the index (R,) of the pattern of each, `num` patterns at most, in the order in which they come first.
     """
     groups = groups_of(_without_start(points), num)
     first = list(dict.fromkeys(groups))
@@ -24,12 +19,9 @@ def patterns_of(points: Array, num: int) -> Indices:
 
 
 def set_apart(points: Array, of: Indices, least: float) -> bool:
-    """Whether different patterns differ `least` times as much as what is of one pattern does, wherever motions begin.
+    """Whether motions (R, n, d) of different patterns (R,) differ `least` times as much as those of one pattern do.
 
-    Args:
-        points: (R, n, d), evenly along each.
-        of: (R,) index of the pattern of each.
-        least: see `AugmentedSettings.apart`.
+    See `AugmentedSettings.apart`. It plays no part where motions begin.
     """
     shapes = _without_start(points)
     apart, same = np.linalg.norm(shapes[:, None] - shapes, axis=-1).mean(axis=-1), of[:, None] == of
@@ -42,12 +34,9 @@ def _without_start(points: Array) -> Array:
 
 
 def told_by_starts(starts: Array, of: Indices, least: float) -> bool:
-    """Whether motions from `starts` (R, d) begin nearest to one of their own pattern, if it has several.
+    """Whether starts (R, d), metres, are nearest to one of their own pattern `of` (R,), if it has several.
 
-    Args:
-        starts: metres.
-        of: (R,) index of the pattern of each.
-        least: least distance of starts of different patterns, metres.
+    Those of different patterns must be at least a distance `least` apart, metres.
     """
     apart = np.linalg.norm(starts[:, None] - starts, axis=-1) + np.diag(np.full(len(starts), np.inf))
     several = np.bincount(of)[of] > 1

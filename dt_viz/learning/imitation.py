@@ -42,7 +42,6 @@ Objective = Literal["trajectory", "velocity"]
 OBJECTIVES: tuple[Objective, ...] = get_args(Objective)
 
 EVEN = 1e-9  # largest difference of successive distances between inducing points, relative to their coordinates
-NOT_INVERTIBLE = "no invertible map follows these demonstrations; do they contradict each other?"
 
 
 @dataclass(frozen=True)
@@ -55,8 +54,7 @@ class ImitationSettings:
 
     objective: Objective = "trajectory"
     num_layers: int = 3
-    """Smallest number of stationary flows that ψ is composed of; motions that turn far get more. The velocity objective
-    has one flow, with the steps of all."""
+    """Smallest number of stationary flows in ψ; motions that turn far get more, the velocity objective has one."""
     max_layers: int = 10
     """Largest number of them."""
     steps: int = 4
@@ -66,8 +64,7 @@ class ImitationSettings:
     min_determinant: float = 0.05
     """Smallest determinant of an Euler step's derivative; at 0 space would fold. The optimiser makes no step there."""
     sigma: float | None = None
-    """Width of a Gaussian. None takes 1 in the plane and 0.6 in space, less for long motions in little space; half of
-    that for the velocity objective."""
+    """Width of a Gaussian. None takes 1 in the plane, 0.6 in space, less for long motions; half for velocities."""
     ell: float | None = None
     """ℓ of the Gaussians in 1/m², instead of `sigma`."""
     num_inducing: int | None = None
@@ -85,13 +82,11 @@ class ImitationSettings:
     max_iterations: int = 20
     """Largest number of Gauss–Newton iterations; L-BFGS, whose iterations are cheaper, takes up to ten times more."""
     max_missed: float = 0.05
-    """Largest Fréchet distance of a motion from its demonstration, relative to the extent, with which the plain state
-    is taken where none is asked for."""
+    """Largest Fréchet distance of a motion from its demonstration, in extents, for "auto" to take the plain state."""
     max_strayed: float = 0.6
     """Distance of a motion from its demonstration at equal times from which a warning is given."""
     beside: float = 0.25
-    """Weight of all motions beside the demonstrations against these, in the plane; see `motions_beside`. In space the
-    fit of `lift_box` loses by them."""
+    """Weight of all motions beside the demonstrations against these, in the plane only; see `motions_beside`."""
     preparation: PreparationSettings = field(default_factory=PreparationSettings)
     """Settings of what is done to the demonstrations before."""
     timing: TimingSettings = field(default_factory=TimingSettings)
@@ -118,7 +113,6 @@ class Imitation(AnyImitation):
 
     @cached_property
     def system(self) -> DiffeomorphicSystem:
-        """The learned dynamical system."""
         return DiffeomorphicSystem(self.transform, self.base)
 
     def system_in(self, origin: Array, axes: Array, scale: float) -> DiffeomorphicSystem:
@@ -279,14 +273,10 @@ def _fit_trajectories(motions: Motions, settings: ImitationSettings, progress: P
 
 
 def motions_beside(motions: Motions, points: Array) -> Array:
-    """Motions from starts on both sides of the mean one, 1.2 standard deviations along each principal axis.
+    """Motions from starts on both sides of the mean of planar motions, sampled at `points` (R, n, 2).
 
-    They are the mean motion with an offset that fades. They tell a fit that knows places alone what to do between
-    demonstrations and beside them.
-
-    Args:
-        motions: R of them, in the plane.
-        points: (R, n, 2) of these.
+    They are the mean motion with an offset that fades, of 1.2 standard deviations along each principal axis. They tell
+    a fit that knows places alone what to do between demonstrations and beside them.
     """
     found, groups = [], groups_of((points - points.mean(axis=(0, 1))) / motions.spread)
     for own in (points[groups == group] for group in range(groups.max() + 1)):
@@ -320,7 +310,7 @@ def _initial_guess(
         thetas = regress(chain, shapes, regularisation)
         if chain.min_step_determinant(thetas) > settings.min_determinant:
             return chain, thetas, np.concatenate([shapes[0][:, 0], shapes[0][:1, -1]]), regularisation
-    raise ImitationError(NOT_INVERTIBLE)
+    raise ImitationError("no invertible map follows these demonstrations; do they contradict each other?")
 
 
 def _fit_velocities(motions: Motions, settings: ImitationSettings, progress: Progress) -> Chain:

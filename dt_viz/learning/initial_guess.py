@@ -10,7 +10,7 @@ the data. It is pushed onto a straight line instead, across that axis: y ↦ y �
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -41,26 +41,22 @@ def unbending(motions: Array, num_stages: int, longest: float, max_stages: int) 
     goal, so that the groups stay side by side in the order in which they arrive.
 
     Args:
-        motions: (R, n, d) motions with a common goal, points of one index corresponding to each other; d is 2 or 3.
-            Their spread (RMS distance from the mean) is about 1.
-        num_stages: smallest number of maps that bend; one more before them spreads the rays.
+        motions: (R, n, d) with a common goal, points of one index corresponding to each other, and a spread of about 1.
+        num_stages: smallest number of maps that bend; one more before them spreads the rays, so that there are at least
+            two more shapes (R, n, d), in each of which every motion ends at the goal.
         longest: largest distance by which a map may move a point; it decides the number of maps.
         max_stages: largest number of maps.
-
-    Returns:
-        At least `num_stages` + 2 arrays (R, n, d). In each, every motion ends at the goal.
     """
     groups = groups_of(motions)
     members = [groups == group for group in range(groups.max() + 1)]
-    unbendings: list[_Unbending | _Shearing]
-    unbendings = [_Unbending(motions[member], keep_arrival=len(members) > 1) for member in members]
+    shapes_of = [_unbent(motions[member], keep_arrival=len(members) > 1) for member in members]
     if len(members) == 1 and (axis := _axis(motions.mean(axis=0))) is not None:
-        unbendings = [_Shearing(motions, axis)]
+        shapes_of = [_sheared(motions, axis)]
 
     def shape(tau: float) -> Array:
         result = np.empty_like(motions)
-        for member, part in zip(members, unbendings, strict=True):
-            result[member] = part.shape(tau)
+        for member, shape_of in zip(members, shapes_of, strict=True):
+            result[member] = shape_of(tau)
         return result
 
     taus = np.linspace(0.0, 1.0, 17)
@@ -82,42 +78,32 @@ def groups_of(motions: Array, num: int | None = None) -> NDArray[np.integer[Any]
     return (fcluster(tree, APART, "distance") if num is None else fcluster(tree, num, "maxclust")) - 1
 
 
-class _Unbending:
-    """The motions of one group as a function of the remaining part of their turning."""
+def _unbent(motions: Array, *, keep_arrival: bool) -> Callable[[float], Array]:
+    """The motions (R, n, d) of one group with their turning scaled by τ: 1 keeps them, 0 straightens their mean."""
+    solid = _solid(motions)
+    mean = solid.mean(axis=0)
+    turned, frames = _turned(_tangents(mean, SMOOTHING))
+    # The turning that is kept: of the arrival, or the middle of all turning, so that no end turns too far.
+    fixed = len(turned) - 1 if keep_arrival else len(turned) // 2
+    from_kept = turned[fixed] - (turned[-1] if keep_arrival else _middle(turned))
 
-    def __init__(self, motions: Array, *, keep_arrival: bool) -> None:
-        solid = _solid(motions)
-        self._mean = solid.mean(axis=0)
-        self._offsets = solid - self._mean
-        self._dim = motions.shape[-1]
-        turned, self._frames = _turned(_tangents(self._mean, SMOOTHING))
-        self._increments = np.diff(turned, axis=0)
-        # The turning that is kept: of the arrival, or the middle of all turning, so that no end turns too far.
-        self._fixed = len(turned) - 1 if keep_arrival else len(turned) // 2
-        self._from_kept = turned[self._fixed] - (turned[-1] if keep_arrival else _middle(turned))
+    def shape(tau: float) -> Array:
+        start = frames[fixed] * Rotation.from_rotvec((tau - 1) * from_kept)
+        rotation = _chain_rotations(tau * np.diff(turned, axis=0), fixed, start) * frames.inv()
+        segments = rotation[:-1].apply(np.diff(mean, axis=0))
+        curve = mean[-1] - np.concatenate([np.cumsum(segments[::-1], axis=0)[::-1], np.zeros((1, 3))])
+        carried = np.stack([rotation.apply(offset) for offset in solid - mean])
+        return (curve + carried)[..., : motions.shape[-1]]
 
-    def shape(self, tau: float) -> Array:
-        """Return the motions (R, n, d) with their turning scaled by `tau`: 1 keeps them, 0 straightens their mean."""
-        start = self._frames[self._fixed] * Rotation.from_rotvec((tau - 1) * self._from_kept)
-        rotation = _chain_rotations(tau * self._increments, self._fixed, start) * self._frames.inv()
-        segments = rotation[:-1].apply(np.diff(self._mean, axis=0))
-        curve = self._mean[-1] - np.concatenate([np.cumsum(segments[::-1], axis=0)[::-1], np.zeros((1, 3))])
-        carried = np.stack([rotation.apply(offset) for offset in self._offsets])
-        return (curve + carried)[..., : self._dim]
+    return shape
 
 
-class _Shearing:
-    """Motions as a function of the remaining part of their mean's offset from a straight line, across an axis."""
-
-    def __init__(self, motions: Array, axis: Array) -> None:
-        mean = motions.mean(axis=0)
-        part = ((mean - mean[0]) @ axis / ((mean[-1] - mean[0]) @ axis))[:, None]
-        self._motions = motions
-        self._offset = mean - (1 - part) * mean[0] - part * mean[-1]
-
-    def shape(self, tau: float) -> Array:
-        """Return the motions (R, n, d) with the offset scaled by `tau`: 1 keeps them, 0 straightens their mean."""
-        return self._motions - (1 - tau) * self._offset
+def _sheared(motions: Array, axis: Array) -> Callable[[float], Array]:
+    """The motions (R, n, d) with their mean's offset from a straight line, across an axis, scaled by τ."""
+    mean = motions.mean(axis=0)
+    part = ((mean - mean[0]) @ axis / ((mean[-1] - mean[0]) @ axis))[:, None]
+    offset = mean - (1 - part) * mean[0] - part * mean[-1]
+    return lambda tau: motions - (1 - tau) * offset
 
 
 def _axis(mean: Array) -> Array | None:
@@ -185,16 +171,10 @@ def _chain_rotations(increments: Array, kept: int, start: Rotation) -> Rotation:
 
 
 def regress(chain: FlowChain, shapes: Sequence[Array], regularisation: float, iterations: int = 5) -> list[Array]:
-    """Fit each layer, one after the other, to carry its shape to the next one.
+    """Fit each of L layers, one after the other, to carry its shape, of L + 1 (R, n, d), to the next one.
 
-    Args:
-        chain: L layers.
-        shapes: L + 1 arrays (R, n, d).
-        regularisation: weight of the squared RKHS norm against the mean squared distance.
-        iterations: number of fixed-point iterations for the path through the layer's Euler steps.
-
-    Returns:
-        The coefficients (m_l, d) of each layer.
+    The regularisation weighs the squared RKHS norm against the mean squared distance; fixed-point iterations find the
+    path through the layer's Euler steps. Returns the coefficients (m_l, d) of each layer.
     """
     h = 1.0 / chain.steps
     current = shapes[0].reshape(-1, chain.dim)

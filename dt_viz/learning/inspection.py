@@ -36,8 +36,7 @@ class PreparationSettings:
     max_moved_end: float = 0.3
     """Distance from the goal up to which an end is moved there; farther ones are left out."""
     max_turned_end: float = 0.6
-    """Angle, rad, from the goal's orientation up to which the hand at an end is turned there without a word, and counts
-    in the mean that this is."""
+    """Angle, rad, from the goal's orientation, a mean, up to which an end counts in it and is turned without a word."""
     at_goal: float = 0.05
     """Distance from the goal up to which a start is at the goal."""
     standing_step: float = 1e-3
@@ -63,8 +62,7 @@ class PreparationSettings:
     leave_out: bool = True
     """Whether takes that end elsewhere are left out; otherwise their ends are moved, however far."""
     outlier: float = 3.0
-    """Least length of the jumps to an outlier and back, relative to a long step (the 75 % quantile) of the take. The
-    longest step of clean takes is 2.2, at any rate."""
+    """Least length of jumps to an outlier and back, in long steps (75 % quantile) of the take; clean ones have 2.2."""
     smallest_outlier: float = 0.03
     """Least length of these jumps, relative to the take's size, twice the median distance from its middle."""
     jitter: float = 1.05
@@ -292,7 +290,7 @@ def smoothed_turns(take: Repaired, vectors: Array, settings: PreparationSettings
 class _Grid:
     """Even times over a take, at most 2,000, and positions there with a small second difference.
 
-    f = argmin Σ_i ‖x_i − f(node of t_i)‖² + λ Σ ‖second difference of f‖². It passes frequencies far below the cut-off
+    f = argmin Σ_i ‖x_i − f(node of t_i)‖² + λ Σ ‖second difference of f‖² passes frequencies far below the cut-off
     1/(2π) (c/λ)^¼ / h, for c samples at each node and a distance h of the nodes; where no samples are, it is a cubic.
     """
 
@@ -301,10 +299,9 @@ class _Grid:
         times, x = take.times, take.positions
         spacing = max(float(np.median(np.diff(times))), times[-1] / 2000)
         self.nodes = np.linspace(0.0, times[-1], int(np.rint(times[-1] / spacing)) + 1)
-        for k in straight:
-            between = self.nodes[self.within(take.times[k : k + 2])]
-            x = np.concatenate([x, interpolate(between, times, take.positions)])
-            times = np.concatenate([times, between])
+        between = [self.nodes[self.within(times[k : k + 2])] for k in straight]
+        x = np.concatenate([x, *(interpolate(at, times, x) for at in between)])
+        times = np.concatenate([times, *between])
         self._times, self._x, self._mean = times, x, x.mean(axis=0)
         at = np.rint(times / times.max() * (len(self.nodes) - 1)).astype(int)
         self._counts = np.bincount(at, minlength=len(self.nodes)).astype(float)

@@ -57,6 +57,8 @@ class AnyImitation(ABC):
     """Label of each demonstration that was given; None without labels."""
     augmented: AugmentedSettings = field(default_factory=AugmentedSettings)
     """Settings of the augmented state."""
+    goal_orientation: Array | None = None
+    """(4,) orientation of the hand at the goal, wxyz; None where orientations were not learned."""
 
     @property
     def known_labels(self) -> tuple[float, ...]:
@@ -66,7 +68,7 @@ class AnyImitation(ABC):
     @property
     def has_orientation(self) -> bool:
         """Whether the hand's orientation was learned, too."""
-        return False
+        return self.goal_orientation is not None
 
     @cached_property
     @abstractmethod
@@ -75,12 +77,9 @@ class AnyImitation(ABC):
 
     @abstractmethod
     def system_in(self, origin: Array, axes: Array, scale: float) -> DiffeomorphicSystem:
-        """The system in a space of more dimensions, where a place y becomes origin + scale·axes·y.
+        """The system in R^D, where a place y becomes origin + scale·axes·y, metres.
 
-        Args:
-            origin: (D,), metres.
-            axes: (D, D) orthonormal columns; y has the first d coordinates.
-            scale: metres for one unit of y.
+        Of the orthonormal columns axes (D, D), y has the first d coordinates.
         """
 
     def to_arrays(self) -> dict[str, Array]:

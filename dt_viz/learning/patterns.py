@@ -41,8 +41,8 @@ class AugmentedSettings:
     max_knots: int = 480
     """Largest number of knots."""
     knot_error: float = 0.003
-    """Mean distance of a demonstration from the curve through its knots up to which these are enough, and least
-    deviation of demonstrations that predictors are told apart by."""
+    """Mean distance of a demonstration from the curve through its knots up to which these are enough; also the least
+    deviation that predictors are told apart by."""
     min_spread: float = 0.04
     """Smallest spread that is reckoned with: starts nearer to each other teach nothing of what they do."""
     width: float = 2.0
@@ -56,17 +56,13 @@ class AugmentedSettings:
     reach: float = 4.0
     """Distance from the mean start, in spreads, over which the fading that was learned becomes u."""
     evidence: float = 4.0
-    """Number of independent deviations that a demonstration counts for when predictors are weighted: more than its
-    coordinates, fewer than its knots, whose deviations are alike."""
+    """Number of independent deviations of a demonstration when predictors are weighted: fewer than its knots."""
     time_noise: float = 1.0
-    """Variance of clocks that the starts do not explain, relative to what they do; of the hand's turns where there are
-    too few demonstrations to leave one out."""
+    """Variance of clocks that starts do not explain, relative to what they do; of turns if too few can be left out."""
     turn_noises: tuple[float, ...] = (0.2, 0.4, 1.0, 2.5, 6.0)
-    """That of the hand's turns: their geometric mean is taken, weighted by how likely turns that are left out make
-    them."""
+    """That of the hand's turns: their geometric mean, weighted by how likely turns that are left out make them."""
     time_width: float = 0.1
-    """Width of a kernel of that variance, in spreads, so that a demonstration's own start has its own timing and
-    turns."""
+    """Width of a kernel of that variance, in spreads: a demonstration's own start has its own timing and turns."""
     time_jitter: float = 0.02
     """Part of that variance that remains noise."""
     num_paces: int = 80
@@ -76,8 +72,7 @@ class AugmentedSettings:
     min_pace: float = 2e-3
     """Smallest speed of the phase, relative to its mean: it never stands still."""
     min_length: float = 0.1
-    """Least length of a motion that its clock is predicted for, relative to that of the mean: from the goal to the goal
-    a motion still takes some time."""
+    """Least length that a clock is predicted for, relative to that of the mean: from the goal, too, takes time."""
     caught_within: float = 0.15
     """Largest change of the phase of a motion that is pushed, relative to s_max."""
     caught_above: float = 0.05
@@ -85,14 +80,12 @@ class AugmentedSettings:
     max_patterns: int = 8
     """Largest number of patterns that are looked for."""
     max_missed: float = 0.12
-    """Largest Fréchet distance of a motion from its demonstration; with a larger one, more patterns are looked for.
-    Handwriting of one pattern stays below 9 %."""
+    """Largest Fréchet distance of a motion from its demonstration before more patterns are looked for."""
     apart: float = 2.0
-    """Least distance of demonstrations of different patterns, relative to the largest one within a pattern: scatter
-    without gaps is one pattern, however large. There are at most half as many patterns as demonstrations, or two."""
+    """Least distance of demonstrations of different patterns, relative to the largest one within a pattern. There are
+    at most half as many patterns as demonstrations, or two."""
     min_apart: float = 0.01
-    """Least distance of the starts of different patterns that tells these apart; nearer to each other, what is followed
-    would hang on how a start is rounded, so that labels tell them."""
+    """Least distance of the starts of different patterns that tells these apart; nearer ones are told by labels."""
     preparation: PreparationSettings = field(default_factory=PreparationSettings)
     """Settings of what is done to the demonstrations before."""
 
@@ -193,8 +186,7 @@ class Pattern:
     timing: StartProcess
     """(1 + P,) offsets from that logarithm, and from the profile."""
     turn: Array | None = None
-    """(K, 3) mean rotation vectors of the hand at the goal's orientation, at the knots, in metres by the length that a
-    radian counts; None without orientations."""
+    """(K, 3) mean rotation vectors of the hand at the knots, times a radius, metres; None without orientations."""
     turning: StartProcess | None = None
     """(K, 3) offsets from them."""
 
@@ -245,14 +237,7 @@ class Pattern:
 def learn_patterns(
     motions: Motions, of: Indices, labels: Sequence[float] | None, settings: AugmentedSettings
 ) -> tuple[Pattern, ...]:
-    """Learn the patterns of motions.
-
-    Args:
-        motions: R of them.
-        of: (R,) index of the pattern of each.
-        labels: label of each pattern; None without labels.
-        settings: settings of the augmented state.
-    """
+    """Learn the patterns of R motions, the index (R,) of the pattern of each, and perhaps the label of each pattern."""
     starts, poses = motions.starts, motions.poses(settings.turn_length * motions.extent)
     at_knots = _at_knots(poses, motions.extent, settings)
     points, turns = np.split(at_knots, [starts.shape[1]], axis=2)
@@ -319,15 +304,10 @@ def _predictor(
 ) -> tuple[Array, Array, float, StartProcess]:
     """Mean, fading, its reach and shapes of a pattern: the mean of all predictors that are tried.
 
-    A predictor is ordinary kriging: what is left of the demonstrations without their fading offsets is an unknown mean
-    plus a Gaussian process over the starts. What it makes of each demonstration from the others is known in closed
-    form, and its likelihood falls with the mean of these errors.
-
-    Args:
-        points: (R, K, d) demonstrations at the knots, metres.
-        spread: of their starts, metres.
-        least: error that counts as none, metres.
-        settings: settings of the augmented state.
+    A predictor is ordinary kriging: what is left of the demonstrations `points` (R, K, d) without their fading offsets
+    is an unknown mean plus a Gaussian process over the starts, whose spread is given, metres. What it makes of each
+    demonstration from the others is known in closed form, and its likelihood falls with the mean of these errors, of
+    which a `least` one, metres, counts as none.
     """
     num, u, reach = len(points), _phases(points.shape[1]), settings.reach * spread
     process = StartProcess.of(points[:, 0], points, spread, settings.width, settings.noise)

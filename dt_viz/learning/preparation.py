@@ -27,8 +27,7 @@ class ImitationError(ValueError):
 class NoCommonGoalError(ImitationError):
     """Demonstrations that end at several places, none of them the place of most.
 
-    Attributes:
-        goals: for each place, what ends there and where, and the place (d,), metres; those of most takes first.
+    Its `goals` are, those of most takes first, what ends at each place and where, and the place (d,), metres.
     """
 
     def __init__(self, message: str, goals: Sequence[tuple[str, tuple[float, ...]]]) -> None:
@@ -124,11 +123,9 @@ class Motions:
         return float(self.distances(system, states).max()) / self.extent
 
     def distances(self, system: DiffeomorphicSystem, states: Array) -> Array:
-        """Discrete Fréchet distances (R,) of a system's motions from these.
+        """Discrete Fréchet distances (R,) of the motions of a system from these, which begin in states (R, k).
 
-        Args:
-            system: of states, the first d coordinates of which are a place.
-            states: (R, k) in which its motions begin.
+        The first d coordinates of its states are a place.
         """
         wanted = self.resampled()
         z = system.base.at_fraction(system.transform.forward(states), np.linspace(1.0, 0.0, wanted.shape[1]))

@@ -42,11 +42,9 @@ class ChoiceSettings:
     folds: int = 5
     """Largest number of folds in which that is done."""
     iterations: int = 5
-    """Largest number of iterations of a plain fit to those of a fold: fewer than it gets when it is chosen, for what is
-    left out gains little by more."""
+    """Largest number of iterations of a plain fit to those of a fold; what is left out gains little by more."""
     alike: float = 1.05
-    """Distance of plain motions from what was left out, relative to that of augmented ones, up to which they are as
-    good."""
+    """Ratio of plain motions' distance from what was left out to augmented ones', up to which they are as good."""
     close: float = 0.005
     """The same distance, relative to the extent, up to which they are good however good augmented ones are."""
     hopeless: float = 1.25
@@ -65,17 +63,11 @@ def learn(
     augmented: AugmentedSettings | None = None,
     choice: ChoiceSettings | None = None,
 ) -> AnyImitation:
-    """Learn a stable motion in the state that is asked for.
+    """Learn a stable motion in the state that is asked for, from demonstrations that end at (about) the same place.
 
-    Args:
-        demonstrations: at least one, all ending at (about) the same place.
-        settings: of the plain fit; None takes the defaults.
-        state: see the module.
-        labels: a number for each demonstration, which makes the state augmented; see `fit_augmented`.
-        progress: see `dt_viz.learning.imitation.fit`.
-        plain: gives the plain fit with these settings; None fits it here.
-        augmented: settings of the augmented state; None takes the defaults, with the preparation of the plain fit.
-        choice: settings of the choice; None takes the defaults.
+    Labels, a number for each demonstration, make the state augmented; see `fit_augmented`. None takes default settings,
+    for the augmented state with the preparation of the plain fit. `plain` gives the plain fit with some settings; None
+    fits it here, telling the progress, see `dt_viz.learning.imitation.fit`.
 
     Raises:
         ImitationError: nothing can be learned, there is no such state, or the plain state is to have labels.
@@ -119,14 +111,8 @@ def leaving_out(
 ) -> StateChoice:
     """Follow motions by what the others teach in both states, in a few folds or until the plain one is clearly worse.
 
-    Motions of all lengths are in each fold, in whichever order they come. Goal and size are those of all motions, in
-    both states and for the mean alike.
-
-    Args:
-        motions: at least two.
-        choice: settings of the choice.
-        augmented: settings of the augmented state.
-        progress: see `dt_viz.learning.imitation.fit`.
+    Motions of all lengths are in each fold, in whichever order they come; there must be two at least. Goal and size are
+    those of all motions, in both states and for the mean alike.
     """
     off, folds = np.empty((3, 0)), min(choice.folds, len(motions.numbers))
     by_length = np.argsort([arc_length(path)[-1] for path in motions.positions], kind="stable")

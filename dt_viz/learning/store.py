@@ -67,14 +67,10 @@ class FitStore:
         settings: ImitationSettings | None = None,
         progress: Progress | None = None,
     ) -> Imitation:
-        """Return the plain imitation of these demonstrations, fitted if it is new.
+        """Return the plain imitation of these demonstrations, fitted if it is new; None takes default settings.
 
-        Args:
-            demonstrations: motions to imitate.
-            settings: settings of the fit; None takes the defaults.
-            progress: see `dt_viz.learning.imitation.fit`; not called for a known fit. It may raise an exception to
-                cancel, which is let through; to those who wait for another's fit it is called repeatedly, also
-                without news.
+        Progress, see `dt_viz.learning.imitation.fit`, is not called for a known fit. It may raise an exception to
+        cancel, which is let through; to those who wait for another's fit it is called repeatedly, also without news.
 
         Raises:
             ImitationError: as `dt_viz.learning.imitation.fit`.

@@ -42,11 +42,7 @@ class Style:
         return cls(offsets - np.linspace(1, 0, len(offsets))[:, None] * offsets[0])
 
     def on(self, imitation: AugmentedImitation, amount: float) -> AugmentedImitation:
-        """A motion in this style.
-
-        Args:
-            imitation: of any action with as many coordinates.
-            amount: part of the style that is put on; a negative one is taken off.
+        """A motion of any action in this style, of which a part is put on; a negative amount is taken off.
 
         Raises:
             ImitationError: it has more or fewer coordinates.

@@ -59,14 +59,12 @@ class TimedAttractor(Attractor):
     """Width of the blend between demonstrations, relative to the distance between neighbours."""
 
     def velocity(self, z: Array) -> Array:
-        """Compute ż, (*B, d), m/s."""
         offset = z - self.goal
         clock = self._clock(np.linalg.norm(offset, axis=-1))
         _, inside, first, second = self._segment(clock[..., None], self._blended(offset))
         return super().velocity(z) / (first + inside / self._spacing * (second - first))
 
     def flow(self, z0: Array, times: Array) -> Array:
-        """Compute z(t), (*B, T, d), from `z0` (*B, d) at `times` (T,) or (*B, T), seconds, in closed form."""
         offset = z0 - self.goal
         r0 = np.linalg.norm(offset, axis=-1, keepdims=True)
         paces = self._blended(offset)
@@ -76,7 +74,6 @@ class TimedAttractor(Attractor):
         return self.goal + shrink[..., None] * offset[..., None, :]
 
     def times_at(self, z0: Array, distances: Array) -> Array:
-        """Compute when, (*B, T), s, motions from `z0` (*B, d) come within `distances` (*B, T), m, of the goal."""
         offset = z0 - self.goal
         r0 = np.linalg.norm(offset, axis=-1, keepdims=True)
         clocks = self._clock(np.concatenate([r0, np.minimum(distances, r0)], axis=-1))
@@ -84,13 +81,7 @@ class TimedAttractor(Attractor):
         return togo[..., :1] - togo[..., 1:]
 
     def placed(self, origin: Array, axes: Array, scale: float) -> TimedAttractor:
-        """Return the same attractor in a space of more dimensions: a point z becomes origin + scale·axes·z.
-
-        Args:
-            origin: (D,), metres.
-            axes: (D, d) orthonormal columns.
-            scale: metres for one unit of z.
-        """
+        """Return the same attractor in R^D, where a point z becomes origin + scale·axes·z, axes (D, d) orthonormal."""
         return replace(
             self,
             goal=origin + scale * (axes @ self.goal),

@@ -65,14 +65,10 @@ class TrajectoryFit:
         Args:
             thetas: initial coefficients, one array (m_l, d) for each layer, that fold nothing.
             ends: initial images.
-            refuses: whether a step that folds is refused, which is looked at after each; without, the result may fold.
             max_iterations: largest number of Gauss–Newton iterations.
+            refuses: whether a step that folds is refused, which is looked at after each; without, the result may fold.
             tolerance: relative decrease of the cost below which the iteration stops.
-            report: called with the iteration and the root mean square distance; an exception that it raises ends the
-                fit.
-
-        Returns:
-            The coefficients and the images.
+            report: called with the iteration and the root mean square distance; what it raises ends the fit.
         """
         damping = 1e-3
         weights = self.weights().reshape(-1, self.chain.dim, self.chain.dim)
@@ -144,8 +140,7 @@ class TrajectoryFit:
 class _DampedSystem:
     """(JᵀJ + D)·step = gradient with a diagonal D of two values, solved in the smaller of the two spaces.
 
-    With more unknowns than residuals, which is the rule in space, by Woodbury's identity:
-    step = D⁻¹(g − Jᵀ(I + J·D⁻¹·Jᵀ)⁻¹·J·D⁻¹·g).
+    With more unknowns than residuals by Woodbury's identity: step = D⁻¹(g − Jᵀ(I + J·D⁻¹·Jᵀ)⁻¹·J·D⁻¹·g).
     """
 
     def __init__(self, jacobian: Array, num_first: int) -> None:

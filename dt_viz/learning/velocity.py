@@ -36,14 +36,9 @@ class VelocityFit:
     """Smallest determinant of a step's derivative; W with a smaller one are refused."""
 
     def solve(self, max_iterations: int, report: Callable[[int, float], None] | None = None) -> Array:
-        """Minimise by L-BFGS from W = 0, as long as no step folds space.
+        """Minimise by L-BFGS from W = 0, as long as no step folds space; returns W, (m, d).
 
-        Args:
-            max_iterations: largest number of L-BFGS iterations.
-            report: called with the iteration and the cost; an exception that it raises ends the fit.
-
-        Returns:
-            W, (m, d).
+        `report` is called with the iteration and the cost; an exception that it raises ends the fit.
         """
         shape = (self.grid.num_points, self.grid.dim)
         kept, iteration = np.zeros(shape), 0

@@ -20,7 +20,7 @@ from dt_viz.library.motion import NUM_COORDINATES, Motion
 from dt_viz.library.motion import Path as HandPath
 from dt_viz.motion.following import Follower
 from dt_viz.motion.solve import Solved, solve
-from dt_viz.motion.stack import FINE, LIVE, build_stack
+from dt_viz.motion.stack import FINE, LIVE
 from dt_viz.robot.inverse_kinematics import UnreachableError, best_start, inverse_kinematics, track
 from dt_viz.robot.models import EndEffector, robot_from_urdf
 from dt_viz.robot.models import load_arm as load_robot
@@ -279,8 +279,7 @@ def _live(motion: Motion) -> Solved:
     """The stack of a motion in space, as exactly as a controller needs it."""
     if motion.dimension != NUM_COORDINATES:
         raise ValueError(f"the arm follows motions in space, with 3 coordinates, not {motion.dimension}")
-    scenario, nominal = motion.scenario, motion.nominal
-    return Solved(scenario, nominal, nominal, build_stack(nominal, scenario.active, LIVE))
+    return solve(motion.scenario, motion.nominal, LIVE)
 
 
 def load_arm(name: str = "jaco", tracking: TrackingSettings | None = None, frame: Frame = "base") -> Arm:

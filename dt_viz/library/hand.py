@@ -25,12 +25,9 @@ class HandController:
     """
 
     def __init__(self, motion: Motion, start: ArrayLike, label: float | None = None) -> None:
-        """Begin a motion.
+        """Begin a motion in the plane or in space where the hand is, at a start (d,), metres.
 
-        Args:
-            motion: in the plane or in space.
-            start: (d,) where the hand is, metres.
-            label: of the motion; None takes that of the nearest demonstrated start.
+        Its label is that of the nearest demonstrated start, unless one is given.
 
         Raises:
             FormatError: no demonstration has such a label, or the start is not d finite numbers.

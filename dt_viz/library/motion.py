@@ -38,8 +38,8 @@ from dt_viz.library.takes import Demonstrations, check_goals, demonstrations_of
 from dt_viz.motion.certificates import Certificates, DrawnSamples, certified
 from dt_viz.motion.diagnostics import motion_warnings
 from dt_viz.motion.nominal import NUM_SAMPLES, Learned, Nominal
-from dt_viz.motion.solve import Solved
-from dt_viz.motion.stack import FINE, Solution, build_stack
+from dt_viz.motion.solve import Solved, solve
+from dt_viz.motion.stack import FINE, Solution
 from dt_viz.saving import SavedMotion, load_motion, save_motion
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.tasks import Task
@@ -91,10 +91,8 @@ class Motion:
         The error is the discrete Fréchet distance of the learned motion, without transforms, from the repaired take.
         """
         learned, lines = self._learned, [repr(self)]
-        if self.reason:
-            lines.append(f"{self.state} state: {self.reason}")
-        elif learned.imitation.choice:
-            lines.append(f"{self.state} state: {learned.imitation.choice}")
+        if why := self.reason or learned.imitation.choice:
+            lines.append(f"{self.state} state: {why}")
         if text := orientation_line(learned.imitation, learned.task.demonstrations):
             lines.append(text)
         paths = [path[:, : self.dimension] for path in learned.demonstrated.paths]
@@ -236,17 +234,15 @@ class Motion:
     @property
     def demonstrated_labels(self) -> tuple[float, ...]:
         """The label of each demonstration, given or found; none where there are none."""
-        return self._learned.demonstrated_labels
+        return self._learned.imitation.labels or ()
 
     def certificates(self) -> Certificates:
         """Checks of the paths from the demonstrations' starts, and warnings."""
-        nominal, solution, scenario = self.nominal, self.solution, self.scenario
-        solved = Solved(scenario, nominal, nominal, solution, None, None)
-        bundle, path = solution.bundle, solution.bundle.positions
-        times = solution.rays.times(bundle.index, bundle.fraction)
-        drawn = DrawnSamples(bundle.index, bundle.fraction, times, path, len(nominal.status))
-        clearance = float(scenario.obstacle.signed_distance(path).min())
-        return certified(Certificates(clearance, found=motion_warnings(solved, drawn)), solution, drawn)
+        solution, bundle = self.solution, self.solution.bundle
+        times, path = solution.rays.times(bundle.index, bundle.fraction), bundle.positions
+        drawn = DrawnSamples(bundle.index, bundle.fraction, times, path, len(self.nominal.status))
+        clearance = float(self.scenario.obstacle.signed_distance(path).min())
+        return certified(Certificates(clearance, found=motion_warnings(self.solved, drawn)), solution, drawn)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the motion to a file (npz, whatever its suffix): what was learned, the demonstrations and the stack.
@@ -257,19 +253,9 @@ class Motion:
             DataError: a transform is not one of `dt_viz.avoidance.registry.KINDS`, or holds what could not be read.
             OSError: the file cannot be written.
         """
-        learned = self._learned
-        imitation = learned.imitation
-        augmented = imitation.state == "augmented"
-        saved = SavedMotion(
-            learned.task.demonstrations,
-            self._layers,
-            augmented,
-            imitation.labels,
-            self.reason,
-            imitation.augmented,
-            self.inspections,
-        )
-        save_motion(path, saved, imitation)
+        demonstrations, imitation = self._learned.task.demonstrations, self._learned.imitation
+        chosen = self.state == "augmented", imitation.labels, self.reason, imitation.augmented
+        save_motion(path, SavedMotion(demonstrations, self._layers, *chosen, self.inspections), imitation)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Motion:
@@ -286,9 +272,14 @@ class Motion:
         return cls(learned, saved.layers, saved.inspections)
 
     @cached_property
+    def solved(self) -> Solved:
+        """The motion of the hand, as exactly as it is computed."""
+        return solve(self.scenario, self.nominal, FINE)
+
+    @property
     def solution(self) -> Solution:
-        """The stack, as exactly as it is computed."""
-        return build_stack(self.nominal, self.scenario.active, FINE)
+        """Its stack."""
+        return self.solved.stack
 
     @property
     def scenario(self) -> Scenario:

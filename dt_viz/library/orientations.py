@@ -9,22 +9,18 @@ from dt_viz.errors import FormatError
 from dt_viz.flows.fields import Array
 from dt_viz.flows.rollouts import Bundle, Rays
 from dt_viz.flows.rotations import turning
+from dt_viz.learning.augmented import AugmentedImitation
 from dt_viz.learning.demonstrations import checked_orientations
-from dt_viz.learning.poses import Poses
 
 NOT_LEARNED = "none: no orientations were learned"
 
 
 def along(
-    poses: Poses | None, rays: Rays, bundle: Bundle, begin: ArrayLike | None
+    poses: AugmentedImitation | None, rays: Rays, bundle: Bundle, begin: ArrayLike | None
 ) -> tuple[Array, ...] | tuple[None, ...]:
     """Orientations (T_i, 4), wxyz, of each of a bundle of motions; None where none were learned.
 
-    Args:
-        poses: what was learned of the hand's pose.
-        rays: the motions in base space.
-        bundle: their samples.
-        begin: (R, 4), or (4,) for all, orientations in which they begin; None is as they were learned.
+    They begin with those that are given, (R, 4), or (4,) for all; None begins as they were learned.
 
     Raises:
         FormatError: `begin` is no orientations, or none were learned.
@@ -45,14 +41,10 @@ def along(
     return bundle.split(poses.orientations(system.transform.inverse(z)[:, 3:6]))
 
 
-def angular_velocity(poses: Poses | None, rest: Array, orientation: ArrayLike, dt: float) -> Array:
-    """ω (3,), rad/s, in the base frame, that takes a hand to the orientation that its motion has `dt` seconds later.
+def angular_velocity(poses: AugmentedImitation | None, rest: Array, orientation: ArrayLike, dt: float) -> Array:
+    """ω (3,), rad/s, in the base frame, that takes a hand, of which the orientation (4,) is given, on with its motion.
 
-    Args:
-        poses: what was learned of the hand's pose.
-        rest: (1 + c,) phase and condition of the motion.
-        orientation: (4,) of the hand, wxyz.
-        dt: seconds.
+    That is to the orientation `dt` seconds later than at a phase and for a condition, `rest` (1 + c,).
 
     Raises:
         FormatError: the orientation is none, or none were learned.

@@ -52,11 +52,7 @@ def example(name: str) -> tuple[Demonstration, ...]:
 
 
 def demonstrations_of(given: Any, rate: float | None = None) -> tuple[Demonstration, ...]:  # noqa: ANN401 - see `fit`
-    """Demonstrations of what was given to `fit`, checked, with names.
-
-    Args:
-        given: see `fit`.
-        rate: samples a second, Hz, of what has no times; None takes it as 5 s long.
+    """Demonstrations of what was given to `fit`, checked, with names; `rate`, Hz, is that of what has no times.
 
     Raises:
         DataError: it is no demonstrations.

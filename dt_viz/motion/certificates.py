@@ -177,7 +177,8 @@ def certified_map(
         by_hand: whether an integration was chosen by hand.
     """
     moved = np.flatnonzero((y != x).any(axis=1))
-    keep = _evenly(moved if len(moved) else np.arange(len(y)), num)
+    rows = moved if len(moved) else np.arange(len(y))
+    keep = rows[np.unique(np.linspace(0, len(rows) - 1, num).astype(int))]
     images, det = _quicker(transform).forward(y), np.linalg.det(transform.jacobian(y[keep])[1])
     off = images - x
     if by_hand:
@@ -187,16 +188,15 @@ def certified_map(
         det = np.append(det, inverse[~(inverse > 0)])
     least, beside = float(det.min()), _longest(off * unit)
     missed = _longest((transform.inverse(transform.forward(y[keep])) - y[keep]) * unit)
-    warnings = []
-    if not least > 0:
-        text = f"det J falls to {least:.2g}: the map folds space, the stack is no diffeomorphism there"
-        warnings.append(MotionWarning(Kind.NO_DIFFEOMORPHISM, text))
-    if not missed <= MAX_ROUND_TRIP:
-        text = f"a round trip through the stack misses by {1e3 * missed:.3g} mm: steps too coarse"
-        warnings.append(MotionWarning(Kind.ROUND_TRIP, text))
-    if not beside <= tolerance:
-        text = f"what is shown is up to {in_millimetres(beside)} beside the motion of the base system"
-        warnings.append(MotionWarning(Kind.OFF_MOTION, text))
+    folds = f"det J falls to {least:.2g}: the map folds space, the stack is no diffeomorphism there"
+    loses = f"a round trip through the stack misses by {1e3 * missed:.3g} mm: steps too coarse"
+    differs = f"what is shown is up to {in_millimetres(beside)} beside the motion of the base system"
+    checks = (
+        (Kind.NO_DIFFEOMORPHISM, least > 0, folds),
+        (Kind.ROUND_TRIP, missed <= MAX_ROUND_TRIP, loses),
+        (Kind.OFF_MOTION, beside <= tolerance, differs),
+    )
+    warnings = (MotionWarning(kind, text) for kind, holds, text in checks if not holds)
     worst = min(least, np.inf if known.min_det_jacobian is None else known.min_det_jacobian)
     known = replace(known, min_det_jacobian=worst, round_trip_error=max(missed, known.round_trip_error or 0.0))
     return known.warning(*warnings), images
@@ -216,11 +216,6 @@ def _quicker(transform: Diffeomorphism) -> Diffeomorphism:
     if isinstance(transform, Conjugated) and isinstance(transform.inner, AdaptiveFlow):
         return replace(transform, inner=replace(transform.inner, tolerance=POSTURE_TOLERANCE))
     return transform
-
-
-def _evenly(rows: Indices, num: int) -> Indices:
-    """At most `num` of the rows, evenly spread."""
-    return rows[np.unique(np.linspace(0, len(rows) - 1, num).astype(int))]
 
 
 def _longest(vectors: Array) -> float:

@@ -31,7 +31,12 @@ NUM_CHECKED_LIVE = 300
 
 
 def motion_warnings(solved: Solved, drawn: DrawnSamples, robot: Robot | None = None) -> tuple[MotionWarning, ...]:
-    """Why the motion that is drawn, of a robot or the hand alone, is not to be trusted."""
+    """Why the motion that is drawn, of a robot or the hand alone, is not to be trusted, and what it does not get."""
+    found = _of_motion(solved, drawn, robot)
+    return found if robot is None else (*found, *_of_anchors(solved.stack, robot), *_of_targets(solved, drawn))
+
+
+def _of_motion(solved: Solved, drawn: DrawnSamples, robot: Robot | None) -> tuple[MotionWarning, ...]:
     nominal, scenario, stack, arm = solved.nominal, solved.scenario, solved.stack, solved.arm
     missed = float(np.linalg.norm(drawn.positions[-1] - nominal.goal))
     found = [text for text in nominal.imitation.warnings if text not in nominal.task.seen]
@@ -58,7 +63,6 @@ def motion_warnings(solved: Solved, drawn: DrawnSamples, robot: Robot | None = N
 
 
 def _of_arm(solved: Solved) -> list[MotionWarning]:
-    """Warnings about the way that the whole arm finds."""
     nominal, arm, avoidance, warnings = solved.nominal, solved.arm, solved.scenario.arm_avoidance, []
     assert arm is not None
     assert avoidance is not None
@@ -75,7 +79,7 @@ def _of_arm(solved: Solved) -> list[MotionWarning]:
     return [*warnings, *start_warnings(beside, nominal.added, Kind.START_COVERED, how, WHOLE_ARM)]
 
 
-def anchor_warnings(stack: Solution, robot: Robot) -> tuple[MotionWarning, ...]:
+def _of_anchors(stack: Solution, robot: Robot) -> tuple[MotionWarning, ...]:
     """Warnings about transforms that lead motions to where a robot's hand cannot be."""
     said = []
     for name, transform in ((applied.name, applied.transform) for applied in stack.built):
@@ -97,7 +101,7 @@ def _top(solved: Solved, applied: Applied, drawn: DrawnSamples | Bundle) -> Moti
     return MotionBelow(nominal.starts, nominal.goal, *samples, **told)
 
 
-def target_warnings(solved: Solved, drawn: DrawnSamples) -> tuple[MotionWarning, ...]:
+def _of_targets(solved: Solved, drawn: DrawnSamples) -> tuple[MotionWarning, ...]:
     """Warnings about transforms that the stack satisfies, but the avoidance of obstacles does not."""
     if not solved.scenario.avoids or solved.scenario.warp < 1:
         return ()
@@ -111,12 +115,7 @@ def target_warnings(solved: Solved, drawn: DrawnSamples) -> tuple[MotionWarning,
 
 
 def margin_warnings(scenario: Scenario, nearest: Mapping[int, Nearest]) -> tuple[MotionWarning, ...]:
-    """Warnings where the arm's meshes keep less than the margin that was asked for.
-
-    Args:
-        scenario: whose margin it is.
-        nearest: of each motion that the whole arm avoids with, by its place.
-    """
+    """Warnings where the arm's meshes keep less than the margin, from what is nearest on each motion, by its place."""
     place, kept = min(nearest.items(), key=lambda item: item[1].distance)
     avoidance = scenario.arm_avoidance
     asks = avoidance is not None and scenario.warp == 1 and avoidance.duration is None
@@ -131,7 +130,6 @@ def margin_warnings(scenario: Scenario, nearest: Mapping[int, Nearest]) -> tuple
 
 
 def _of_integration(solved: Solved, robot: Robot | None) -> tuple[MotionWarning, ...]:
-    """Warnings about integrators that were chosen by hand."""
     stack, arm, avoidance = solved.stack, solved.arm, solved.scenario.arm_avoidance
     warnings, bundle = [], stack.bundle
     for level, applied in enumerate(stack.built, 1):
@@ -180,16 +178,10 @@ def integration_warnings(
 def fold_warnings(
     name: str, flow: Diffeomorphism, integration: Integration, y: Array, x: Array
 ) -> tuple[MotionWarning, ...]:
-    """Whether a step of a flow whose integration was chosen by hand folds space.
+    """Whether a step of a flow whose integration was chosen by hand folds space; see `integration_warnings`.
 
-    Only the steps that start from or lead to these samples are looked at: what folds beside them is not found.
-
-    Args:
-        name: of the transform.
-        flow: its ψ, or a chain with it, in these or other coordinates; nothing is said of what has no steps.
-        integration: of that flow.
-        y: (N, d) samples of the motions with the transform.
-        x: (N, d) the samples below, which ψ⁻¹ leads to `y`.
+    Only the steps that start from or lead to the samples are looked at: what folds beside them is not found. The flow
+    may be part of a chain, or in other coordinates; nothing is said of what has no steps.
     """
     if not integration.by_hand:
         return ()

@@ -77,12 +77,9 @@ class Follower:
     """Lifts motions of the end effector to the joints."""
 
     def __init__(self, robot: Robot, memo: Memo | None = None, shared: Memo | None = None) -> None:
-        """Take an arm.
+        """Take an arm, and what keeps the joints along what a drag leaves unchanged.
 
-        Args:
-            robot: the arm.
-            memo: what keeps the joints along what a drag leaves unchanged.
-            shared: what keeps the reference postures of tasks, for other followers, too.
+        `shared` keeps the reference postures of tasks, for other followers, too.
         """
         self.robot = robot
         self.whole_arm = WholeArm(robot)
@@ -90,11 +87,7 @@ class Follower:
         self._shared = Memo() if shared is None else shared
 
     def undisturbed(self, nominal: Nominal) -> Lift:
-        """The joints along the motion without any behaviour.
-
-        Raises:
-            UnreachableError: the arm cannot get to where the motions start.
-        """
+        """The joints along the motion without any behaviour; raises as `reference`."""
         own = self._demonstrated(nominal.learned, nominal.posture)
         if nominal.shaping.all():
             return own
@@ -130,13 +123,10 @@ class Follower:
         return self._demonstrated(nominal.learned, nominal.posture).pins
 
     def behaving(self, nominal: Nominal, solution: Solution, *, exact: bool) -> Lift:
-        """The joints along the motion with the behaviours of the end effector.
+        """The joints along a solution: the motion with the behaviours of the end effector on the nominal one.
 
-        Args:
-            nominal: what it begins from.
-            solution: that motion.
-            exact: whether the end effector is on that motion between the samples, too; else it may be off by
-                millimetres where the stack stretches space.
+        If `exact`, the end effector is on that motion between the samples, too; else it may be off by millimetres where
+        the stack stretches space.
         """
         samples, drawn = np.linspace(0, 1, NUM_CONFIGURATIONS), []
         for path, fractions in zip(solution.bundle.paths, solution.bundle.split(solution.bundle.fraction), strict=True):
@@ -165,12 +155,9 @@ class Follower:
         return replace(lifted, exactly=exactly)
 
     def along(self, nominal: Nominal, path: Array, orientations: Array | None = None) -> TrackedPath:
-        """The joints along one path (T, 3) of the end effector, metres.
+        """The joints along one path (T, 3) of the end effector, metres, perhaps with orientations (T, 4), wxyz.
 
-        Args:
-            nominal: the motion whose posture the arm stays near to.
-            path: where the end effector goes.
-            orientations: (T, 4) of it there, wxyz; None wants none.
+        The arm stays near to the posture of the nominal motion.
         """
         return track(self.robot, path, self.reference(nominal), orientations=orientations)
 
@@ -179,12 +166,8 @@ class Follower:
     ) -> Admission:
         """Whether the whole arm can move around what it avoids, from which starts, and with which reference posture.
 
-        Args:
-            nominal: all rollouts.
-            avoidance: what is to be avoided.
-            posture: that where the obstacle was just before, which is kept while none leaves more starts free; None is
-                the usual one.
-            keeps: whether it is kept while it leaves the goal and any start free.
+        The `posture` that it had where the obstacle was just before, None for the usual one, is kept while no other
+        leaves more starts free, or, if it `keeps` it, while that leaves the goal and any start free.
         """
         asked = avoidance.avoided, avoidance.margin, posture, keeps
         return self._memo("admission", (nominal, asked), lambda: self._admission(nominal, *asked), newest=2)
@@ -242,11 +225,9 @@ class Follower:
     ) -> Iterator[tuple[Posture | None, Mask]]:
         """The postures with most room at the task's starts and goal, the best first: the usual one where it has enough.
 
-        But the posture `last`, if it is not the usual one, comes before all that leave no more starts free; where it
-        is kept, before all, if it leaves the goal and any start free.
-
-        Yields:
-            A reference posture, None for the usual one; which of the starts and the goal (R + 1,) it leaves free.
+        But the posture `last`, if it is not the usual one, comes before all that leave no more starts free; where it is
+        kept, before all, if it leaves the goal and any start free. With each reference posture, None for the usual one,
+        comes which of the starts and the goal (R + 1,) it leaves free.
         """
         room = self.whole_arm.clearance(self._demonstrated(learned, last).pins, obstacle, margin)
         is_ample = last is None and bool((room >= margin).all())
@@ -278,11 +259,7 @@ class Follower:
         return margin + self.whole_arm.settings.pin
 
     def reference_postures(self, learned: Learned, num_lots: int = 1) -> ReferencePostures:
-        """The reference postures for a task's motions; the first time it takes a second or so for each lot.
-
-        Raises:
-            UnreachableError: the arm cannot get to where the motions start.
-        """
+        """The reference postures for a task's motions, a second's work the first time; raises as `reference`."""
         usual, paths = self._demonstrated(learned).reference, learned.demonstrated.paths
         return self._shared(
             "reference_postures",
@@ -292,11 +269,7 @@ class Follower:
         )
 
     def out_of_reach(self, nominal: Nominal) -> Mask:
-        """(R,) added starts that the arm cannot get to.
-
-        Raises:
-            UnreachableError: the arm cannot get to where the task's motions start.
-        """
+        """(R,) added starts that the arm cannot get to; raises as `reference`."""
         return nominal.added & (self.undisturbed(nominal).tracked.error[:, 0] > MAX_TRACKING_ERROR)
 
     def warnings(self, joints: TrackedPath, place: int) -> tuple[MotionWarning, ...]:
@@ -380,10 +353,10 @@ def arm_samples(num: int) -> Indices:
 
 
 def room_at_rest(robot: Robot, task: Task, obstacle: Union, places: Array) -> Array:
-    """Distance (N,), metres, of the arm from the obstacle where the hand rests at `places` (N, 3).
+    """Distance (N,), metres, of the arm from the obstacle while the hand rests at `places` (N, 3).
 
     Raises:
-        UnreachableError: the arm cannot get to the task's starts, near whose posture it stays.
+        UnreachableError: the arm cannot get to the task's starts.
     """
     reference = inverse_kinematics(robot, task.starts.mean(axis=0))
     start = np.broadcast_to(reference, (len(places), robot.num_joints))

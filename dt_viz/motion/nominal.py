@@ -14,8 +14,8 @@ from dt_viz.flows.diffeomorphisms import Identity
 from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.flows.rollouts import Bundle, Rays, evenly_sampled
 from dt_viz.flows.systems import DiffeomorphicSystem
+from dt_viz.learning.augmented import AugmentedImitation
 from dt_viz.learning.interface import AnyImitation
-from dt_viz.learning.poses import Poses
 from dt_viz.scenario.scenario import Start
 from dt_viz.scenario.tasks import Task
 from dt_viz.warning import MotionWarning
@@ -76,7 +76,7 @@ class Learned:
         return self.system.transform.inverse(base_states)[:, :3]
 
     @cached_property
-    def poses(self) -> Poses | None:
+    def poses(self) -> AugmentedImitation | None:
         """The motions of the hand's pose, in the world; None of motions without orientations."""
         predictions = getattr(self.system.base, "predictions", None)
         return getattr(predictions, "poses", None)
@@ -85,11 +85,6 @@ class Learned:
     def labels(self) -> tuple[float, ...]:
         """The labels that a start may have."""
         return self.imitation.known_labels
-
-    @property
-    def demonstrated_labels(self) -> tuple[float, ...]:
-        """The label of each demonstration; none where there are none."""
-        return self.imitation.labels or ()
 
     def trajectory(self, start: Start) -> NominalTrajectory:
         """The rollout from an added start; a label that it cannot have is that of the nearest demonstrated start."""

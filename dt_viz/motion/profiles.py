@@ -56,14 +56,7 @@ class Profiles:
 
 
 def profiles(motion: Solved, drawn: DrawnSamples, rollout: int, follower: Follower) -> Profiles:
-    """Profiles of a rollout, with and without behaviours.
-
-    Args:
-        motion: what it is a rollout of.
-        drawn: its rollouts.
-        rollout: place of this one.
-        follower: the arm.
-    """
+    """Profiles of a rollout, by its place among those that are drawn, with and without behaviours."""
     nominal, arm, task, rows = motion.nominal, motion.arm, motion.nominal.task, drawn.index == rollout
     obstacle, of_mean = motion.scenario.obstacle, bool(nominal.added[rollout])
     demonstration = task.mean_path if of_mean else task.paths[rollout]
@@ -90,14 +83,9 @@ def profiles(motion: Solved, drawn: DrawnSamples, rollout: int, follower: Follow
 
 
 def profile(path: Array, demonstration: Array, potential: Array, clearance: Array, depth: float) -> Profile:
-    """Profile of one motion.
+    """Profile of one motion of the end effector, with T samples, and its demonstration (M, 3), metres.
 
-    Args:
-        path: (T, 3) end effector at its samples, metres.
-        demonstration: (M, 3), metres.
-        potential: (T,) Lyapunov value at the samples.
-        clearance: (T,) of what avoids the obstacles at the samples, metres.
-        depth: how deep that enters them, metres, negative where it is clear.
+    Of what avoids the obstacles, the clearance is at the samples, and the depth negative where it is clear, metres.
     """
     length = arc_length(path)
     moves = np.r_[True, np.diff(length) > 0]

@@ -54,22 +54,18 @@ class Solved:
         return self.arm is None or self.arm.cleared
 
 
-def solve(scenario: Scenario, nominal: Nominal, precision: Precision, follower: Follower) -> Solved:
-    """The motion of a scenario, every flow run for its full duration.
+def solve(scenario: Scenario, nominal: Nominal, precision: Precision, follower: Follower | None = None) -> Solved:
+    """The motion of a scenario, every flow run for its full duration; see `warped`.
 
-    Args:
-        scenario: whose stack it is; its `warp` is left to `warped`. Sides on which the motions of its `passing` pass
-            obstacles are kept while these are dragged.
-        nominal: the undisturbed motion, from starts that the arm can begin at. Where the arm finds no way, that of the
-            result has another reference posture, or lacks the starts that have none.
-        precision: how exactly.
-        follower: the arm.
+    Sides on which the motions of its `passing` pass obstacles are kept while these are dragged. The nominal motion is
+    from starts that the arm can begin at; where the arm finds no way, that of the result has another reference posture,
+    or lacks the starts that have none. Without a follower it is that of the end effector alone.
 
     Raises:
         UnreachableError: the whole arm is to avoid, and cannot get to where the motions start.
     """
     scenario, avoidance = replace(scenario, warp=1.0), scenario.arm_avoidance
-    if avoidance is None or avoidance.duration is not None:
+    if follower is None or avoidance is None or avoidance.duration is not None:
         return _solved(scenario, nominal, precision, follower)
     passing = scenario.passing or ANEW
     if precision is LIVE and passing.follows(avoidance.avoided.parts):
@@ -121,7 +117,7 @@ def _as_many(nominal: Nominal, passing: Passing) -> Nominal:
 
 
 def _solved(
-    scenario: Scenario, nominal: Nominal, precision: Precision, follower: Follower, *, follows: bool = False
+    scenario: Scenario, nominal: Nominal, precision: Precision, follower: Follower | None, *, follows: bool = False
 ) -> Solved:
     """The motion with the reference posture of `nominal`, see `solve`; `follows` is whether it goes on in a drag."""
     passing = scenario.passing or ANEW
@@ -129,7 +125,7 @@ def _solved(
     avoidance = scenario.arm_avoidance
     hand = {applied.place: applied.made.detours for applied in stack.built if any(applied.made.detours)}
     passed = Passing(hand, posture=nominal.posture, status=nominal.status)
-    if avoidance is None:
+    if avoidance is None or follower is None:
         return Solved(scenario, nominal, nominal, stack, passing=passed)
     live = precision is LIVE
     lifted = follower.behaving(nominal, stack, exact=not live) if stack.built else follower.undisturbed(nominal)
@@ -145,12 +141,7 @@ def _solved(
 def warped(full: Solved, below: Nominal, fraction: float, precision: Precision, follower: Follower) -> Solved:
     """The motion with every flow run for a fraction of its duration: straight to the goal at 0, in full at 1.
 
-    Args:
-        full: the motion at 1, at the same precision.
-        below: its undisturbed motion, warped as far.
-        fraction: s, from 0 to 1.
-        precision: how exactly.
-        follower: the arm.
+    It takes the full motion, at the same precision, and its undisturbed motion, `below`, warped as far.
 
     Raises:
         UnreachableError: as `solve`.

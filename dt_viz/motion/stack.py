@@ -95,10 +95,6 @@ class Solution:
         """The warnings of the transforms."""
         return tuple(warning for applied in self.built for warning in applied.made.warnings)
 
-    def at(self, place: int) -> Applied | None:
-        """The layer at this place in the whole stack, as it was made; None where it is off."""
-        return next((applied for applied in self.built if applied.place == place), None)
-
     def positions_at(self, index: Indices, fraction: Array) -> Array:
         """End effector (N, 3), metres, of the rollouts `index` (N,) at the fractions `fraction` (N,) of their rays."""
         return self.transform.inverse(self.rays.at(index, fraction))[:, :3]
@@ -132,11 +128,8 @@ def build_stack(
     transforms move change the motion a little; so look whether the transforms still fit, and mend them if not. Where
     there is no way to the goal beside an obstacle that nearly touches it, the motions may end beside the goal.
 
-    Args:
-        nominal: the undisturbed motion.
-        layers: those that act, from the inside out, each with its place in the whole stack; see `Scenario.active`.
-        precision: how exactly.
-        passing: sides to keep while obstacles are dragged.
+    The layers act from the inside out, each with its place in the whole stack; see `Scenario.active`. The sides of
+    `passing` are kept while obstacles are dragged.
     """
     detours = [
         carried_over(passing.hand.get(place, ()), layer.transform.avoided.parts, turn=precision is LIVE)
@@ -171,17 +164,11 @@ def build_stack(
 
 
 def warped_stack(nominal: Nominal, full: Solution, fraction: float, precision: Precision) -> Solution:
-    """The rollouts of a stack whose flows run for a fraction of their durations.
+    """The rollouts of a stack whose flows run for a fraction of their durations, on a motion that is warped as far.
 
     At 0 motions are the base attractor's, straight to the goal; at 1 they are those of the stack. In between, too, each
     transform is a diffeomorphism and motions are exact: starts and goal stay, so the rays of base space are those
-    between their images.
-
-    Args:
-        nominal: warped by the same fraction.
-        full: the stack whose flows they are. Where it moves the goal, motions end that fraction of the way.
-        fraction: s, from 0 to 1.
-        precision: as it was solved with.
+    between their images. Where the full stack moves the goal, motions end that fraction of the way.
     """
     outer = [applied.made.transform.scaled(fraction) for applied in full.built]
     built = tuple(

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import numpy as np
 from scipy import ndimage
@@ -14,7 +13,7 @@ from dt_viz.errors import FormatError
 from dt_viz.files.checks import check_at_least, check_finite
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.obstacles.occupancy import fit_occupancy
-from dt_viz.obstacles.solids import Solid
+from dt_viz.obstacles.solids import ByContent, Solid
 from dt_viz.obstacles.triangles import grid_nodes
 
 MIN_POINTS = 50
@@ -63,7 +62,7 @@ def check_points(points: Array, labels: Array | None) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class Cloud:
+class Cloud(ByContent):
     """Points on or in a solid, or labelled points; compared and hashed by content.
 
     Raises:
@@ -76,26 +75,10 @@ class Cloud:
     """(K,) 1 occupied and 0 free; None where all are occupied."""
 
     def __post_init__(self) -> None:
-        for name in ("points", "labels"):
-            if (values := getattr(self, name)) is not None:
-                array = np.array(values, dtype=float)
-                array.flags.writeable = False
-                object.__setattr__(self, name, array)
+        self._keep(points=float, labels=float)
         check_points(self.points, self.labels)
         if self.labels is None:  # a search among very many points in one place takes the square of their number
             check_at_least("points", len(np.unique(self.points, axis=0)), MIN_POINTS, "different ones")
-
-    @cached_property
-    def digest(self) -> bytes:
-        """Hash of points and labels."""
-        labels = b"" if self.labels is None else self.labels.tobytes()
-        return hashlib.blake2b(self.points.tobytes() + labels, digest_size=16).digest()
-
-    def __eq__(self, other: object) -> bool:
-        return self is other or (isinstance(other, Cloud) and self.digest == other.digest)
-
-    def __hash__(self) -> int:
-        return hash(self.digest)
 
     @property
     def solid(self) -> Solid:

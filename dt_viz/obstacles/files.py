@@ -1,13 +1,4 @@
-"""Obstacles' shapes from files: closed meshes and point clouds.
-
-Meshes, in metres (or scaled to them): STL, OBJ, PLY, GLB, glTF with its data inside, OFF, 3MF. They must be closed, but
-for small holes (see `dt_viz.files.repair`).
-
-Point clouds, in metres (or scaled to them):
-    PLY (``.ply``): the vertices, with labels if they have a property ``occupied``, ``occupancy`` or ``label``.
-    npz (``.npz``): ``points`` (K, 3), and optionally ``labels`` (K,). Pickled arrays are never opened.
-    CSV (``.csv``), UTF-8: a header line with ``x``, ``y``, ``z`` and optionally ``occupied``, and one line per point.
-    Labels are 1 (occupied) or 0 (free); without them every point is occupied.
+"""Obstacles' shapes from files of closed meshes and point clouds; see the table in `dt_viz/files/README.md`.
 
 The origin of a shape is moved to the middle of its bounding box. Files are read by a process of their own
 (`dt_viz.files.uploads`).
@@ -16,13 +7,15 @@ The origin of a shape is moved to the middle of its bounding box. Files are read
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
-from dt_viz.errors import Cancelled, DataError, FormatError, naming, never, parsing
-from dt_viz.files.checks import check_triangles, checked_suffix, real_numbers
+from dt_viz.errors import Cancelled, DataError, FormatError, never, parsing
+from dt_viz.files.checks import check_triangles, checked_suffix
+from dt_viz.files.shapes import Points, Triangles
 from dt_viz.files.uploads import read_upload
 from dt_viz.flows.fields import Array
 from dt_viz.obstacles.clouds import Cloud, check_points
@@ -68,26 +61,6 @@ class SizeError(ShapeError):
         return f"{self.source} seems to be in {self.unit}: {box} units. Read it in {self.unit}?"
 
 
-@dataclass(frozen=True)
-class LoadedMesh:
-    """A closed mesh, ready to be an obstacle."""
-
-    solid: Solid
-    name: str
-    notes: tuple[str, ...] = ()
-    """Descriptions, for the page, of what was repaired and of what is inexact."""
-
-
-@dataclass(frozen=True)
-class LoadedCloud:
-    """A point cloud, ready to be an obstacle."""
-
-    cloud: Cloud
-    name: str
-    notes: tuple[str, ...] = ()
-    """Descriptions, for the page, of what was left out."""
-
-
 def is_cloud(content: bytes, source: str | Path) -> bool:
     """Return whether a file holds points rather than a mesh, as its suffix or, in a PLY file, its header says."""
     suffix = Path(source).suffix.lower()
@@ -97,7 +70,9 @@ def is_cloud(content: bytes, source: str | Path) -> bool:
     return suffix in CLOUD_SUFFIXES
 
 
-def read_mesh(content: bytes, source: str | Path, *, scale: float = 1.0, cancelled: Cancelled = never) -> LoadedMesh:
+def read_mesh(
+    content: bytes, source: str | Path, *, scale: float = 1.0, cancelled: Cancelled = never
+) -> tuple[Solid, tuple[str, ...]]:
     """Read a closed mesh from the bytes of a file, such as one uploaded from the browser.
 
     Args:
@@ -106,76 +81,61 @@ def read_mesh(content: bytes, source: str | Path, *, scale: float = 1.0, cancell
         scale: metres for one unit of the file.
         cancelled: whether nobody wants it any more.
 
+    Returns:
+        The solid, and notes for the page on what was repaired and what is inexact.
+
     Raises:
         ShapeError: the file is not what its suffix says, or holds no closed mesh of a sensible size. Nothing else is
             raised, whatever the file holds.
         UnwantedError: nobody wants it any more.
     """
-    source = Path(source)
-    suffix = _suffix(content, source, MESH_SUFFIXES, scale)
-    with parsing(ShapeError, source, "file", f"a {suffix} file of a mesh"):
-        arrays, notes = read_upload("mesh", suffix, content, cancelled)
-        vertices, faces = real_numbers(arrays[0], "vertices"), real_numbers(arrays[1], "faces").astype(np.intp)
-        check_triangles(vertices, faces)
-        vertices = _checked_size(vertices, vertices[faces].reshape(-1, 3), source, scale)
-        solid = Solid(vertices, faces)
+    with _reading(content, source, MESH_SUFFIXES, scale) as files:
+        read = read_upload(Triangles, files, cancelled)
+        check_triangles(read.vertices, read.faces)
+        corners = read.vertices[read.faces]
+        solid = Solid(_in_metres(read.vertices, corners.reshape(-1, 3), source, scale), read.faces)
         grid = solid.distances
-    if not grid.depth > 0:
-        found = f"walls thinner than {1e3 * grid.cell:.1f} mm, which leave nothing inside"
-        raise ShapeError(source, "thickness", found, f"a solid thicker than about {2e3 * grid.cell:.0f} mm")
-    a, b, c = vertices[faces].swapaxes(0, 1)
+        if not grid.depth > 0:
+            found = f"walls thinner than {1e3 * grid.cell:.1f} mm, which leave nothing inside"
+            raise FormatError("thickness", found, f"a solid thicker than about {2e3 * grid.cell:.0f} mm")
+    a, b, c = solid.vertices[solid.faces].swapaxes(0, 1)
     volume = float(np.einsum("ni,ni->", a, np.cross(b, c))) / 6
-    if grid.cell**3 * len(grid.interior) < LOST * volume:
-        notes += (f"parts thinner than about {2e3 * grid.cell:.0f} mm are rounded away from its distances",)
-    return LoadedMesh(solid, source.stem, notes)
+    lost = grid.cell**3 * len(grid.interior) < LOST * volume
+    return solid, read.notes + (f"parts thinner than about {2e3 * grid.cell:.0f} mm are rounded away",) * lost
 
 
-def read_cloud(content: bytes, source: str | Path, *, scale: float = 1.0, cancelled: Cancelled = never) -> LoadedCloud:
-    """Read a point cloud from the bytes of a file, such as one uploaded from the browser.
-
-    Args:
-        content: all bytes of the file.
-        source: its name or path; the suffix says what it is.
-        scale: metres for one unit of the file.
-        cancelled: whether nobody wants it any more.
-
-    Raises:
-        ShapeError: the file is not what its suffix says, or holds no points that make a solid of a sensible size.
-            Nothing else is raised, whatever the file holds.
-        UnwantedError: nobody wants it any more.
-    """
-    source = Path(source)
-    suffix = _suffix(content, source, CLOUD_SUFFIXES, scale)
-    with parsing(ShapeError, source, "file", f"a {suffix} file of points"):
-        arrays, notes = read_upload("points", suffix, content, cancelled)
-        points, labels = real_numbers(arrays[0], "points"), None
-        if len(arrays) > 1:
-            labels = real_numbers(arrays[1], "labels")
+def read_cloud(
+    content: bytes, source: str | Path, *, scale: float = 1.0, cancelled: Cancelled = never
+) -> tuple[Cloud, tuple[str, ...]]:
+    """Read a point cloud from the bytes of a file; arguments, notes and errors as of :func:`read_mesh`."""
+    with _reading(content, source, CLOUD_SUFFIXES, scale) as files:
+        read = read_upload(Points, files, cancelled)
+        points, labels, notes = read.points, read.labels, read.notes
         check_points(points, labels)
-        occupied = points if labels is None else points[labels > 0.5]
-        points = _checked_size(points, occupied, source, scale)
+        points = _in_metres(points, points if labels is None else points[labels > 0.5], source, scale)
         if len(points) > ENOUGH_POINTS:
             some = np.sort(np.random.default_rng(0).permutation(len(points))[:ENOUGH_POINTS])
             notes += (f"{ENOUGH_POINTS} of its {len(points)} points are used, chosen at random",)
             points, labels = points[some], None if labels is None else labels[some]
-        if labels is None:
-            points = np.unique(points, axis=0)
-        cloud = Cloud(points, labels)
-    with parsing(ShapeError, source, "points", "points that something occupies"):
-        depth = cloud.solid.distances.depth
-    if not depth > 0:
-        raise ShapeError(source, "points", "nothing that has an inside", "points that something occupies")
-    return LoadedCloud(cloud, source.stem, notes)
+        cloud = Cloud(np.unique(points, axis=0) if labels is None else points, labels)
+        if not cloud.solid.distances.depth > 0:
+            raise FormatError("points", "nothing that has an inside", "points that something occupies")
+    return cloud, notes
 
 
-def _suffix(content: bytes, source: Path, accepted: tuple[str, ...], scale: float) -> str:
-    with naming(ShapeError, source):
+@contextmanager
+def _reading(
+    content: bytes, source: str | Path, accepted: tuple[str, ...], scale: float
+) -> Iterator[list[tuple[str, bytes]]]:
+    """Give the name and the content of a file, and turn all errors into such that name it."""
+    name = Path(source).name
+    with parsing(ShapeError, source, "file", f"a {Path(source).suffix} file of a shape"):
         if not (np.isfinite(scale) and scale > 0):
             raise FormatError("scale", f"{scale}", "metres for one unit of the file, above 0")
-        return checked_suffix(len(content), source, accepted, MAX_BYTES)
+        yield [(f"shape{checked_suffix(len(content), Path(name), accepted, MAX_BYTES)}", content)]
 
 
-def _checked_size(points: Array, shape: Array, source: Path, scale: float) -> Array:
+def _in_metres(points: Array, shape: Array, source: str | Path, scale: float) -> Array:
     """Return the points in metres, with the middle of the shape's bounding box at 0."""
     with np.errstate(over="ignore"):
         lower, upper = shape.min(axis=0), shape.max(axis=0)

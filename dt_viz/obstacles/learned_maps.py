@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 
@@ -38,16 +38,8 @@ class MapSettings:
 SETTINGS = MapSettings()
 
 
-class Shape(Hashable, Protocol):
-    """A shape with a signed distance."""
-
-    def signed_distance(self, s: Array) -> Array:
-        """Distance (N,) of points `s` (N, 3) from the surface, negative inside."""
-        ...
-
-
 @lru_cache(maxsize=32)
-def unit_map(shape: Shape) -> OccupancyMap:
+def unit_map(shape: Any) -> OccupancyMap:  # noqa: ANN401 - an `Obstacle`, whose module imports this one
     """Learn the occupancy of a shape about the origin whose largest half size is 1."""
     return learned(lambda s: shape.signed_distance(s) < 0)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -53,8 +53,33 @@ SMALLEST = 1e-9
 """Smallest size of a solid, and inverse of the largest, in its own unit."""
 
 
+class ByContent:
+    """Base of dataclasses of arrays, which are copied and kept read-only; they are compared and hashed by content."""
+
+    def _keep(self, **kinds: type) -> None:
+        """Replace arrays by read-only copies of these types."""
+        for name, kind in kinds.items():
+            if (values := getattr(self, name)) is not None:
+                array = np.array(values, dtype=kind)
+                array.flags.writeable = False
+                object.__setattr__(self, name, array)
+
+    @cached_property
+    def digest(self) -> bytes:
+        """Hash of all arrays."""
+        arrays = [getattr(self, field.name) for field in fields(self)]  # pyright: ignore[reportArgumentType]
+        content = b"".join(array.tobytes() for array in arrays if array is not None)
+        return hashlib.blake2b(content, digest_size=16).digest()
+
+    def __eq__(self, other: object) -> bool:
+        return self is other or (type(other) is type(self) and self.digest == getattr(other, "digest", b""))
+
+    def __hash__(self) -> int:
+        return hash(self.digest)
+
+
 @dataclass(frozen=True, eq=False)
-class Solid:
+class Solid(ByContent):
     """The solid enclosed by triangles; compared and hashed by its vertices and faces.
 
     Raises:
@@ -67,23 +92,9 @@ class Solid:
     """(F, 3) indices of vertices."""
 
     def __post_init__(self) -> None:
-        for name, kind in (("vertices", float), ("faces", np.intp)):
-            array = np.array(getattr(self, name), dtype=kind)
-            array.flags.writeable = False
-            object.__setattr__(self, name, array)
+        self._keep(vertices=float, faces=np.intp)
         check_triangles(self.vertices, self.faces)
         check_between("size", float(np.ptp(self.bounds, axis=0).max()), SMALLEST, 1 / SMALLEST)
-
-    @cached_property
-    def digest(self) -> bytes:
-        """Hash of vertices and faces."""
-        return hashlib.blake2b(self.vertices.tobytes() + self.faces.tobytes(), digest_size=16).digest()
-
-    def __eq__(self, other: object) -> bool:
-        return self is other or (isinstance(other, Solid) and self.digest == other.digest)
-
-    def __hash__(self) -> int:
-        return hash(self.digest)
 
     @property
     def distances(self) -> DistanceGrid:

@@ -2,31 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from dt_viz.flows.augmented_systems import Frozen
-from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain, Diffeomorphism, Flow, Identity
-from dt_viz.flows.fields import Array, Mask
+from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain, Diffeomorphism, Flow, Identity, Placed
+from dt_viz.flows.fields import Array
 from dt_viz.flows.rollouts import Rays
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.obstacles.union import Union
-from dt_viz.pictures.slice_fields import GRID_SPACING, Clearance, everywhere, streamlines
+from dt_viz.pictures.slice_fields import ARROW_SPACING, everywhere, grid_lines, streamlines
 from dt_viz.scenario.slices import Slice, level_line
 
 MARGIN = 0.18
 """Margin around the base attractor's rays, relative to their extent."""
-ARROW_SPACING = 0.027
-"""Spacing of a generator's arrows, metres."""
 NEGLIGIBLE = 0.03
 """Length of an arrow, relative to the longest, below which it is left out."""
 OUTLINE_SPACING = 0.006
 """Spacing of the lattice in which an obstacle's outline is found, metres."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PanelPicture:
     """A system on a rectangle; all places in metres in the world, before the rectangle is moved aside."""
 
@@ -46,9 +43,8 @@ class PanelPicture:
     """(N, 3) of any unit."""
     outlines: Array = field(default_factory=lambda: np.zeros((0, 2, 3)))
     """(K, 2, 3) segments where obstacles cross the rectangle."""
-    grid: tuple[Array, ...] = ()
-    """(2, 3) lines of the lattice whose image is the warped grid."""
-
+    grid: Array = field(default_factory=lambda: np.zeros((0, 2, 3)))
+    """(K, 2, 3) segments of the lattice whose image is the warped grid."""
     offset: Array = field(default_factory=lambda: np.zeros(3))
     """(3,) from all these places to where they are shown, metres."""
 
@@ -79,8 +75,7 @@ def system_panel(
         demonstrations: (T_i, 3) drawn beside the rollouts.
         coarse: whether it is soon replaced.
     """
-    outlines = np.zeros((0, 2, 3))
-    clearance: Clearance = everywhere
+    outlines, clearance = np.zeros((0, 2, 3)), everywhere
     if obstacle is not None and obstacle.parts:
         clearance, lattice = obstacle.signed_distance, area.grid(OUTLINE_SPACING)
         distance = clearance(lattice.reshape(-1, 3)).reshape(lattice.shape[:2])
@@ -103,31 +98,32 @@ def generator_panel(title: str, transform: Diffeomorphism, area: Slice) -> Panel
 
     Args:
         title: what is written over it.
-        transform: ψ; what is in it besides flows is left out.
+        transform: ψ.
         area: its rectangle.
     """
-    points = inset(area).lattice(ARROW_SPACING)
-    vectors = -displacements(transform.parts if isinstance(transform, Chain) else [transform], points)
-    seen = long_enough(vectors)
-    return PanelPicture(title, area, points=points[seen], vectors=vectors[seen])
+    points, vectors = generator_arrows(transform, area)
+    return PanelPicture(title, area, points=points, vectors=-vectors)
 
 
-def displacements(transforms: Sequence[Diffeomorphism], points: Array) -> Array:
-    """Return t·V (N, d) of the flows among transforms at points (N, d), added up: roughly what they displace."""
-    flows = [transform for transform in transforms if isinstance(transform, Flow | AdaptiveFlow)]
-    return np.zeros_like(points) + sum(flow.duration * flow.field(points) for flow in flows)
-
-
-def inset(area: Slice) -> Slice:
-    """Return a rectangle whose lattice of arrows keeps clear of the border of another one."""
+def generator_arrows(transform: Diffeomorphism, area: Slice) -> tuple[Array, Array]:
+    """Return places (N, 3) on a rectangle, clear of its border, and the `displacements` (N, 3) there that are seen."""
     width, height = (half - ARROW_SPACING / 2 for half in area.half_size)
-    return replace(area, half_size=(width, height))
-
-
-def long_enough(vectors: Array) -> Mask:
-    """Return which arrows (N, 3) are seen beside the longest (N,)."""
+    points = replace(area, half_size=(width, height)).lattice(ARROW_SPACING)
+    vectors = displacements(transform, points)
     size = np.linalg.norm(vectors, axis=1)
-    return size > NEGLIGIBLE * size.max(initial=0.0)
+    seen = size > NEGLIGIBLE * size.max(initial=0.0)
+    return points[seen], vectors[seen]
+
+
+def displacements(transform: Diffeomorphism, points: Array) -> Array:
+    """Return t·V (N, d) of the flows in a transform at points (N, d), added up: roughly what they displace."""
+    if isinstance(transform, Flow | AdaptiveFlow):
+        return transform.duration * transform.field(points)
+    if isinstance(transform, Placed):
+        inner = transform.to_frame(points)[:, : transform.inner.dim]
+        return transform.to_world(displacements(transform.inner, inner)) - transform.origin
+    parts = transform.parts if isinstance(transform, Chain) else ()
+    return np.zeros_like(points) + sum(displacements(part, points) for part in parts)
 
 
 @dataclass(frozen=True)
@@ -172,17 +168,11 @@ def base_panel(title: str, fit: Fit, *, grid: bool) -> PanelPicture:
     """
     rays, seen = fit.rays, fit.base_area
     system = DiffeomorphicSystem(Identity(rays.base.dim), rays.base)
-    lines, spacing = [], GRID_SPACING
-    for axis, (half, middle) in enumerate(zip(seen.half_size, seen.across(rays.base.goal), strict=True)):
-        for k in range(-int((half + middle) / spacing), 1 + int((half - middle) / spacing)) if grid else ():
-            ends = np.array([-1.0, 1.0])[:, None] * seen.half_size
-            ends[:, axis] = middle + k * spacing
-            lines.append(fit(seen.at(ends)))
     return PanelPicture(
         title,
         fit.area,
         fit(rays.base.goal),
         tuple(fit(np.stack([z0, rays.base.goal])) for z0 in rays.z0),
         tuple(fit(line) for line in streamlines(system, seen, everywhere, coarse=False)),
-        grid=tuple(lines),
+        grid=fit(grid_lines(system, seen, coarse=True)) if grid else np.zeros((0, 2, 3)),
     )

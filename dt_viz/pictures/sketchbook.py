@@ -13,16 +13,7 @@ from dt_viz.flows.rollouts import Rays
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.memo import Memo
 from dt_viz.pictures.occupancy import OccupancyPicture
-from dt_viz.pictures.panels import (
-    ARROW_SPACING,
-    Fit,
-    PanelPicture,
-    base_panel,
-    displacements,
-    inset,
-    long_enough,
-    system_panel,
-)
+from dt_viz.pictures.panels import Fit, PanelPicture, base_panel, generator_arrows, generator_panel, system_panel
 from dt_viz.pictures.slice_fields import ColourPicture, FieldPicture, grid_lines
 from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.tasks import Task
@@ -100,12 +91,11 @@ class Sketchbook:
             for flow in flows[: number - 1]:
                 u = flow.forward(u)
             motions.append(task.to_world(u))
-        points = area.holding(motions).lattice(ARROW_SPACING)
-        dim = flows[0].dim
-        u = ((points - task.origin) @ task.axes / task.scale)[:, :dim]
-        mean = task.scale * (displacements(chosen, u) / len(chosen)) @ task.axes[:, :dim].T
-        seen = long_enough(mean)
-        return GeneratorPicture(points[seen], mean[seen], tuple(motions), len(flows))
+        points, vectors = generator_arrows(self._placed(Chain(chosen)), area.holding(motions))
+        return GeneratorPicture(points, vectors / len(chosen), tuple(motions), len(flows))
+
+    def _placed(self, flows: Chain) -> Placed:
+        return Placed(flows, self.task.origin, self.task.axes, self.task.scale)
 
     def grid(self, area: Slice, transforms: Sequence[Diffeomorphism], *, coarse: bool) -> Array:
         """Return segments (K, 2, 3), metres, of the warped grid.
@@ -146,12 +136,11 @@ class Sketchbook:
         )
 
     def generating(self, area: Slice, title: str) -> PanelPicture | None:
-        """Return what leads the base attractor's motions to the imitation: −V, the mean of all its flows."""
-        picture = self.generator(area, 0)
-        if picture is None:
+        """Return what leads the base attractor's motions to the imitation: −V of all its flows."""
+        if self._flows is None:
             return None
-        inside = (np.abs(area.across(picture.points)) < inset(area).half_size).all(axis=1)
-        return PanelPicture(title, area, points=picture.points[inside], vectors=-picture.displacements[inside])
+        imitation = self._placed(self._flows)
+        return self._panel(title, area, lambda: generator_panel(title, imitation, area))
 
     def _panel(self, key: Hashable, area: Slice, make: Callable[[], PanelPicture]) -> PanelPicture:
         """Return a panel that no obstacle changes, made once."""

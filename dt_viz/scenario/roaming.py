@@ -8,7 +8,7 @@ import numpy as np
 
 from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.flows.fields import Array
-from dt_viz.metrics import resample_by_arc_length
+from dt_viz.metrics import interpolate, resample_by_arc_length
 from dt_viz.numerics import divisor, unit
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.scenario.scenario import Scenario
@@ -71,7 +71,7 @@ def _rose(mean: Array, size: float, rng: np.random.Generator) -> Array:
     at, angle = rng.uniform(0, 2 * np.pi, size=2)
     round_ = np.linspace(0, 2 * np.pi, 4800)
     along = 200 * (0.5 + SETTINGS.along * np.sin(round_ + at))
-    middle = np.stack([np.interp(along, np.arange(201), axis) for axis in mean.T], axis=1)
+    middle = interpolate(along, np.arange(201), mean)
     turned = SETTINGS.turns * round_ + angle
     direction = np.cos(turned)[:, None] * u + np.sin(turned)[:, None] * v
     way = middle + (SETTINGS.beside + size) * np.sin(SETTINGS.swings * round_)[:, None] * direction
@@ -122,7 +122,7 @@ class Chase:
 
     def _at(self, length: float) -> Array:
         along = (self._offset + length) % self._length / self._length * (len(self._way) - 1)
-        return np.array([np.interp(along, np.arange(len(self._way)), axis) for axis in self._way.T])
+        return interpolate(np.array([along]), np.arange(len(self._way)), self._way)[0]
 
 
 class MovingGoal:

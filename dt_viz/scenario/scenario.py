@@ -21,7 +21,13 @@ from dt_viz.scenario.slices import SlicePose
 
 SliceColour = Literal["none", "det", "lyapunov", "occupancy"]
 """Quantity shown as colour on the slice: det J of the stack, its Lyapunov value, or the learned occupancy."""
-SLICE_COLOURS: tuple[SliceColour, ...] = ("none", "det", "lyapunov", "occupancy")
+SLICE_COLOURS: Mapping[SliceColour, str] = {
+    "none": "None",
+    "det": "det J",
+    "lyapunov": "Lyapunov value",
+    "occupancy": "Learned occupancy",
+}
+"""Colours of the slice, with their names on the page."""
 
 MIN_DIAMETER, MAX_DIAMETER = 0.04, 0.30
 """Smallest and largest diameter of an obstacle, metres."""
@@ -35,14 +41,18 @@ MAX_MARGIN = 0.05
 
 @dataclass(frozen=True)
 class Offer:
-    """How the page offers a field of `View`."""
+    """How the page offers a field of `View`, and what it costs."""
 
-    label: str
+    label: str = ""
     hint: str | None = None
+    limits: tuple[float, float, float] = (0.0, 1.0, 0.01)
+    """Smallest and largest value and step of its slider."""
+    needs: tuple[str, ...] | None = None
+    """Other fields that its picture depends on, which is computed while the field is on; None where that is not."""
 
 
-def _offered(default: Any, label: str, hint: str | None = None) -> Any:  # noqa: ANN401
-    return field(default=default, metadata={"offer": Offer(label, hint)})
+def _offered(default: Any, label: str = "", hint: str | None = None, **more: Any) -> Any:  # noqa: ANN401
+    return field(default=default, metadata={"offer": Offer(label, hint, **more)})
 
 
 @dataclass(frozen=True)
@@ -52,51 +62,42 @@ class View:
     demonstrations: bool = _offered(True, "Demonstrations")
     rollouts: bool = _offered(True, "Rollouts")
     ghost: bool = _offered(True, "Undisturbed motions", "what was learned, without obstacles and bias points")
-    """The undeformed rollouts."""
-    field: bool = _offered(True, "Vector field", "velocities on the slice: longer and darker is faster")
-    """Arrows of the vector field on the slice."""
+    field: bool = _offered(True, "Vector field", "velocities on the slice: longer and darker is faster", needs=())
     streamlines: bool = _offered(
         False,
         "Streamlines",
         "motions from all over the slice, exact; of an augmented motion the lines of its field at one phase, which no "
         "motion follows for long",
+        needs=(),
     )
-    """Motions through places all over the slice."""
     slice: SlicePose | None = None
     """Pose of the slice; None is the task's."""
     move_slice: bool = _offered(
         False, "Move the slice", "handles that move and tilt the slice, the plane on which arrows and colours are shown"
     )
-    """Whether the slice has handles, instead of obstacles and bias points."""
-    colour: SliceColour = "none"
+    colour: SliceColour = _offered("none", "Slice colour", "quantity shown as colour on the slice", needs=())  # noqa: RUF009
     phase: float = _offered(
         1.0,
         "Phase",
         "of an augmented motion, whose field changes on the way: the part of it that is left, from 1 at its start to "
         "0 at the goal, for which vector field, streamlines, grid and colours are shown",
     )
-    """Part of a motion that is left, from 1 at its start to 0 at the goal, at which augmented motions are shown on the
-    slice: at each phase they have another field."""
     arm: bool = _offered(True, "Arm")
     ghost_arm: bool = _offered(False, "Arm without avoidance", "at the same moment; links that coincide are left out")
-    """The arm where it would be without avoidance."""
     onion: bool = _offered(
         False, "Arms along the motion", "several, from start to goal, evenly along the path of the hand"
     )
-    """Several arms along the motion, fading."""
     body_points: bool = _offered(
         False, "Body points", "spheres that cover the arm; lines from where each would be without avoidance"
     )
-    """The spheres that cover the arm, and how far avoidance has moved each."""
     joint_plots: bool = _offered(False, "Joint plots", "angles and speeds over time, with their limits")
-    """Joint angles and speeds over time, with their limits."""
     health_plots: bool = _offered(
         False,
         "Plots along the path",
         "Lyapunov value, distance to the demonstration and clearance along the arm's rollout",
+        needs=(),
     )
-    """Lyapunov value, distance to the demonstration and clearance along the rollout that the arm follows."""
-    compared: tuple[str, ...] = ()
+    compared: tuple[str, ...] = _offered((), needs=("their_arm",))
     """Names of methods whose motions are shown beside ours."""
     their_arm: str = ""
     """Name of the one of them whose arm is shown, too; none if empty."""
@@ -108,37 +109,36 @@ class View:
         "Handles",
         "arrows and arcs that move and turn it along axes; a click on an obstacle shows and hides them",
     )
-    """Whether that has handles, which move and turn it along axes."""
-    generator: bool = _offered(False, "Learned generator", "vector field whose flow is the imitation")
-    """Arrows of the learned generator, the vector field whose flow is ψ."""
+    generator: bool = _offered(
+        False, "Learned generator", "vector field whose flow is the imitation", needs=("generator_layer",)
+    )
     generator_layer: int = _offered(
         0,
         "Generator of flow",
         "the imitation is several flows, one after the other: 1 is the first; 0: the mean of all",
+        limits=(0, 3, 1),  # until a picture of the generator says how many there are
     )
-    """Number of the flow of ψ that is shown: 1 is applied first; 0 is the mean of all over time."""
     grid: bool = _offered(
         False,
         "Warped grid ψ⁻¹(grid)",
         "straight lines of base space, as all transforms together bend them",
+        needs=(),
     )
-    """The warped grid: lines of base space seen through ψ⁻¹."""
     panels: tuple[Panel, ...] = _offered(
-        (), "Stack side by side", "the base attractor, with motions straight to the goal, and each level of the stack"
+        (),
+        "Stack side by side",
+        "the base attractor, with motions straight to the goal, and each level of the stack",
+        needs=(),
     )
-    """Systems beside the scene, such as the base attractor."""
     click_to_start: bool = _offered(
         False, "Click to start a rollout", f"on the slice, up to {MAX_STARTS}; drag a ball to move it"
     )
-    """Whether a click on the slice adds a start."""
     start_label: float | None = None
     """Label that new starts get; see `Start`."""
     playing: bool = True
     """Whether the arm moves."""
     replay: bool = _offered(False, "Replay", "its motion again and again, finished, instead of an arm that reacts")
-    """Whether the arm repeats its motion along its rollout, instead of being driven from where it is."""
-    speed: float = _offered(1.0, "Speed", "of the arm: 1 is real time")
-    """Speed of the arm's time, relative to real time."""
+    speed: float = _offered(1.0, "Speed", "of the arm: 1 is real time", limits=(0.25, 3.0, 0.25))
     bias: str = ""
     """Name of the bias point that the panel changes; the newest if empty."""
     bias_handles: bool = _offered(
@@ -146,7 +146,6 @@ class View:
         "Handles",
         "arrows that move it along axes, and a ring around its region; a click on it shows and hides them",
     )
-    """Whether that has handles and a ring around its region."""
     tuned: str = ""
     """Name of the transform of the stack whose settings the panel shows; the outermost if empty."""
     level: str = ""
@@ -161,18 +160,10 @@ class View:
     @property
     def computed(self) -> Mapping[str, object]:
         """What is computed only while it is shown, and the choices that it depends on beside the motion."""
-        wanted = {
-            "place": (self.slice, self.level, self.phase),
-            "field": self.field,
-            "streamlines": self.streamlines,
-            "generator": self.generator and (self.generator_layer,),
-            "grid": self.grid,
-            "colour": self.colour != "none" and self.colour,
-            "panels": self.panels,
-            "health plots": self.health_plots,
-            "compared": self.compared and (self.compared, self.their_arm),
-        }
-        return {name: choices for name, choices in wanted.items() if choices}
+        on = {name: offer.needs for name, offer in OFFERS.items() if getattr(self, name) not in (False, "none", ())}
+        wanted = {name: (name, *needs) for name, needs in on.items() if needs is not None}
+        wanted["place"] = "slice", "level", "phase"
+        return {name: tuple(getattr(self, field) for field in fields) for name, fields in wanted.items()}
 
 
 OFFERS: Mapping[str, Offer] = {

@@ -284,24 +284,15 @@ def own_task(demonstrations: tuple[Demonstration, ...]) -> Task:
     )
 
 
-def lasa_tasks(folder: Path) -> dict[str, TaskEntry]:
-    """Return a drawing task for each .mat file of a folder with the LASA handwriting data, read when it is chosen.
-
-    Raises:
-        DemonstrationError: if the folder cannot be read or holds no .mat file.
-    """
-    return {
-        name: TaskEntry(f"LASA {name}", partial(_lasa_task, name, path)) for name, path in lasa_files(folder).items()
-    }
-
-
 def known_tasks(lasa: Path | None) -> dict[str, TaskEntry]:
-    """Return the tasks that ship with DT-Viz, and those of a folder with the LASA data if there is one.
+    """Return the tasks that ship with DT-Viz, and a drawing for each .mat file of a folder with the LASA data.
 
     Raises:
-        DemonstrationError: as `lasa_tasks`.
+        DemonstrationError: the folder cannot be read or holds no .mat file; each is read when it is chosen.
     """
-    return {**TASKS, **(lasa_tasks(lasa) if lasa is not None else {})}
+    files = {} if lasa is None else lasa_files(lasa)
+    entries = {name: TaskEntry(f"LASA {name}", partial(_lasa_task, name, path)) for name, path in files.items()}
+    return {**TASKS, **entries}
 
 
 def _lasa_task(name: str, path: Path) -> Task:

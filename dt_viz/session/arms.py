@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 
 from dt_viz.learning.imitation import Progress
 from dt_viz.learning.store import FitStore
@@ -13,8 +12,7 @@ from dt_viz.robot.descriptions import local_descriptions
 from dt_viz.robot.making import load_aside
 from dt_viz.robot.models import ARMS, NUM_LOADED
 from dt_viz.robot.robot import Robot
-from dt_viz.scenario.scenario import Scenario
-from dt_viz.scenario.tasks import Task, TaskEntry
+from dt_viz.scenario.tasks import TaskEntry
 from dt_viz.session.engine import Engine
 from dt_viz.session.tasks_in_reach import in_reach
 
@@ -22,14 +20,8 @@ NewEngine = Callable[[str, Progress], Engine]
 """Makes an engine for the arm of a name, loaded with progress."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Workplace:
-    """An arm, and what all engines for it share."""
-
-    robot: Robot
-    tasks: Mapping[str, TaskEntry]
-    """Tasks in its reach, by name."""
-    shared: Memo
+_Workplace = tuple[Robot, Mapping[str, TaskEntry], Memo]
+"""An arm, the tasks in its reach, by name, and what all engines for it share."""
 
 
 class ArmStore:
@@ -39,39 +31,28 @@ class ArmStore:
     """
 
     def __init__(self, tasks: Mapping[str, TaskEntry], fits: FitStore, first: Robot) -> None:
-        """Take what arms share.
-
-        Args:
-            tasks: by name, made for the JACO.
-            fits: what was learned before.
-            first: the arm that visitors begin with.
-        """
+        """Take tasks made for the JACO, by name, what was learned before, and the arm that visitors begin with."""
         self._tasks, self._fits, self._memo = tasks, fits, Memo()
-        self._first = _Workplace(first, in_reach(tasks, first), Memo())
+        self._first: _Workplace = first, in_reach(tasks, first), Memo()
         known = {name: name for name in local_descriptions()} | {name: arm.title for name, arm in ARMS.items()}
         others = {name: title for name, title in known.items() if (name, title) != (first.name, first.title)}
         self.titles = {"": first.title + " (given)" * (first.title in others.values()), **others}
         """Titles of the arms that may be chosen, by their names."""
 
     def engine(self, name: str = "", progress: Progress = lambda _fraction, _message: None) -> Engine:
-        """Make an engine for an arm.
-
-        Args:
-            name: of `titles`.
-            progress: is told how much of loading is done; it may raise an exception to cancel.
+        """Make an engine for an arm of `titles`; `progress` is told how much of it is loaded, and may raise to cancel.
 
         Raises:
             ArmError: its description cannot be used.
             FileNotFoundError: a file of it is gone.
         """
-        place = self._first
-        if name:
-            place = self._memo("arm", name, lambda: self._workplace(name, progress), newest=NUM_LOADED)
-        return Engine(place.tasks, self._fits, place.robot, place.shared)
 
-    def _workplace(self, name: str, progress: Progress) -> _Workplace:
-        robot = load_aside(name, progress)
-        return _Workplace(robot, in_reach(self._tasks, robot), Memo())
+        def load() -> _Workplace:
+            robot = load_aside(name, progress)
+            return robot, in_reach(self._tasks, robot), Memo()
+
+        robot, tasks, shared = self._memo("arm", name, load, newest=NUM_LOADED) if name else self._first
+        return Engine(tasks, self._fits, robot, shared)
 
 
 class Engines:
@@ -93,16 +74,7 @@ class Engines:
             if arm in self._known:
                 engine = self._known[arm]  # the first of two that were made at once
             else:
-                engine.adopt(next(iter(self._known.values())).own)
+                engine.own = next(iter(self._known.values())).own
             others = [(name, known) for name, known in self._known.items() if name != arm]
             self._known = dict([*others[-1:], (arm, engine)])
         return engine
-
-    def bring(self, task: Task, scenario: Scenario) -> tuple[Task, str | None]:
-        """Take a task of the visitor's own, whatever the arm; see `Engine.bring`."""
-        engine = self(scenario.arm)
-        brought = engine.bring(task, scenario.task)
-        with self._lock:
-            for other in self._known.values():
-                other.adopt(engine.own)
-        return brought

@@ -17,13 +17,7 @@ from dt_viz.motion.certificates import (
     certified,
     certified_map,
 )
-from dt_viz.motion.diagnostics import (
-    anchor_warnings,
-    fold_warnings,
-    margin_warnings,
-    motion_warnings,
-    target_warnings,
-)
+from dt_viz.motion.diagnostics import fold_warnings, margin_warnings, motion_warnings
 from dt_viz.motion.following import Follower
 from dt_viz.motion.solve import Solved
 from dt_viz.obstacles.union import Union
@@ -36,9 +30,7 @@ from dt_viz.warning import Kind
 def uncertified(motion: Solved, drawn: DrawnSamples, follower: Follower) -> Certificates:
     """What is known of a motion at once: its clearance, and what it does not get that it wants."""
     kept = motion.arm.clearance if motion.arm else clearance(motion, drawn, motion.scenario.obstacle, follower)
-    found = motion_warnings(motion, drawn, follower.robot)
-    found += (*anchor_warnings(motion.stack, follower.robot), *target_warnings(motion, drawn))
-    return Certificates(kept, found=found)
+    return Certificates(kept, found=motion_warnings(motion, drawn, follower.robot))
 
 
 def clearance(motion: Solved, drawn: DrawnSamples, obstacle: Union, follower: Follower) -> float:

@@ -54,34 +54,22 @@ class Comparison:
     """Motions of other methods, for one engine and on its thread; what an edit leaves unchanged is kept."""
 
     def __init__(self, follower: Follower, memo: Memo) -> None:
-        """Compare methods for this arm."""
         self._follower, self.memo = follower, memo
 
     def of(self, frame: Frame, learned: Learned, notes: Mapping[str, str] | None = None) -> tuple[Compared, ...]:
         """The methods that the view of a frame shows, ours first; those that do not follow a drag as far as known.
 
-        Args:
-            frame: ours, at any stage.
-            learned: its task, learned.
-            notes: what is said of methods, by their names, while they are not planned.
+        Our task is `learned`; `notes`, by the methods' names, say what is waited for.
         """
         return tuple(
             self._compared(method, frame, learned, (notes or {}).get(method.name, WAITS)) for method in _chosen(frame)
         )
 
     def complete(self, frame: Frame, learned: Learned, cancelled: Cancelled) -> Iterator[Mapping[str, str]]:
-        """Work out what is left for a scenario that rests; stops whenever `of` would tell more.
-
-        Args:
-            frame: ours.
-            learned: its task, learned.
-            cancelled: asked between parts of the work.
-
-        Yields:
-            Notes for `of`: which method is planned next, and how many are left.
+        """Work out what is left for a scenario that rests; stops whenever `of` would tell more, with notes for that.
 
         Raises:
-            UnwantedError: it is cancelled.
+            UnwantedError: it is cancelled, which is asked between parts of the work.
         """
         slow = [method for method in _chosen(frame) if self._record(method, learned, frame).known is None]
         for k, method in enumerate(slow):
@@ -134,7 +122,7 @@ class Comparison:
         if isinstance(planner, str):
             return Compared(method, note=planner)
         try:
-            plan = planner.plan(obstacle, learned.task.starts, cancelled)
+            plan = planner(obstacle, learned.task.starts, cancelled)
         except UnreachableError as error:
             return Compared(method, note=str(error))
         stays = sum(len(path) < 2 for path in plan.paths)
@@ -159,7 +147,6 @@ class Comparison:
 
     @kept(NEWEST, by=lambda record, _, rollout: (record, rollout))
     def _arm(self, record: _Record, learned: Learned, rollout: int) -> ArmMotion:
-        """The arm's motion along a rollout of a method whose motions are planned."""
         known = record.known
         assert known is not None
         q, times = self._joints(known, learned, rollout), known.times[rollout]
@@ -190,14 +177,7 @@ class Comparison:
 
 
 def scored(paths: tuple[Array, ...], task: Task, goal: Array, obstacle: Union) -> Scores:
-    """Score motions from a task's starts.
-
-    Args:
-        paths: (N_i, 3) of the end effector, metres, each of at least two samples.
-        task: whose demonstrations they are compared with.
-        goal: (3,) where they are to end, metres.
-        obstacle: what they are to keep clear of.
-    """
+    """Score motions, paths (N_i ≥ 2, 3) from a task's starts to a goal (3,), metres, around an obstacle."""
     even = np.stack([resample_by_arc_length(path, NUM_SAMPLES) for path in paths])
     demonstrated = np.stack([resample_by_arc_length(path, NUM_SAMPLES) for path in task.paths])
     return Scores(
@@ -225,7 +205,6 @@ def curves(path: Array, demonstration: Array, obstacle: Union) -> Array:
 
 
 def _tracked(num: int) -> Indices:
-    """Indices of the samples that the arm follows, of the `num` of a path."""
     return np.unique(arm_samples(num))
 
 

@@ -126,17 +126,13 @@ class Drawing:
     """Makes the pictures of frames; what an edit leaves unchanged is kept."""
 
     def __init__(self, follower: Follower, memo: Memo) -> None:
-        """Draw motions of this arm."""
         self._follower, self.memo = follower, memo
 
     @kept(2, by=lambda frame, _, coarse: _seen(frame, coarse))
     def pictures(self, frame: Frame, others: Mapping[Panel, Learned], coarse: bool) -> Pictures:
-        """The pictures that the view of a frame shows, on its slice and of its level.
+        """The pictures that the view of a frame shows, on its slice and of its level, coarse where they follow a drag.
 
-        Args:
-            frame: its motion.
-            others: the learned motions that panels of other tasks show.
-            coarse: whether they are to follow a drag.
+        The `others` are the learned motions that panels of other tasks show.
         """
         motion, view, area = frame.motion, frame.scenario.view, frame.slice
         built = motion.stack.built[: frame.level]
@@ -158,7 +154,6 @@ class Drawing:
         )
 
     def _carried(self, frame: Frame) -> FieldPicture:
-        """The hand's velocities, carried along by the whole arm's avoidance."""
         motion, robot = frame.motion, self._follower.robot
         assert motion.arm is not None
         postures = self._postures(frame, self._follower.reference(motion.nominal))
@@ -178,7 +173,6 @@ class Drawing:
 
     @kept(2, by=_stacked)
     def _velocities(self, frame: Frame) -> Array:
-        """See `velocities`."""
         return velocities(frame, self._learned_velocities(frame))
 
     @kept(2, by=_learned)

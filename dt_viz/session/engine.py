@@ -53,14 +53,7 @@ class Engine:
     def __init__(
         self, tasks: Mapping[str, TaskEntry], fits: FitStore, robot: Robot, shared: Memo | None = None
     ) -> None:
-        """Take what engines share.
-
-        Args:
-            tasks: by name.
-            fits: what was learned before.
-            robot: the arm.
-            shared: what keeps the results that no visitor's edits change; None keeps them for this engine alone.
-        """
+        """Take what engines share: tasks, what was learned, the arm, and what no visitor's edits change, if any."""
         self._tasks = tasks
         self._fits = fits
         self.memo, self._shared = Memo(), Memo() if shared is None else shared
@@ -74,7 +67,7 @@ class Engine:
         self._last: dict[str, Solved] = {}
         """The last motion of each task: what is shown where a scenario has none."""
         self.own: dict[str, tuple[Task, FitStore]] = {}
-        """The visitor's own tasks by name, the oldest first, and what was learned from each: nobody else sees them."""
+        """The visitor's own tasks by name, the oldest first, and what was learned from each, for all of the engines."""
 
     def title(self, name: str) -> str:
         """Title of the task of that name."""
@@ -89,11 +82,7 @@ class Engine:
         return self.own[name][0] if name in self.own else self._tasks[name]()
 
     def bring(self, task: Task, shown: str) -> tuple[Task, str | None]:
-        """Take a task of the visitor's own.
-
-        Args:
-            task: the task.
-            shown: name of the task that is shown now, which stays.
+        """Take a task of the visitor's own, while another one is `shown`, which stays.
 
         Returns:
             The task with a name and a title of its own, and the name of the own task that had to go, if one had.
@@ -101,15 +90,10 @@ class Engine:
         number = max((int(name.rpartition("_")[2]) for name in self.own), default=0) + 1
         task = replace(task, name=f"{OWN}_{number}", title=f"Your data {number}" if number > 1 else "Your data")
         oldest = next((name for name in self.own if name != shown), None) if len(self.own) >= MOST_OWN else None
-        own = {name: kept for name, kept in self.own.items() if name != oldest}
-        self.adopt(own | {task.name: (task, FitStore(None))})
+        self.own[task.name] = task, FitStore(None)
+        if oldest is not None:
+            del self.own[oldest]
         return task, oldest
-
-    def adopt(self, own: dict[str, tuple[Task, FitStore]]) -> None:
-        """Take the visitor's own tasks as his engine for another arm has them."""
-        gone, self.own = self.own.keys() - own.keys(), own  # at once: others read it
-        for name in gone:
-            self._last.pop(name, None)
 
     def frames(
         self, scenario: Scenario, progress: Progress | None = None, cancelled: Cancelled = never
@@ -118,7 +102,7 @@ class Engine:
 
         Args:
             scenario: what to show.
-            progress: called while a task is fitted for the first time; see `dt_viz.learning.imitation.fit`.
+            progress: told how far learning is; see `dt_viz.learning.imitation.fit`.
             cancelled: asked after stage LIVE, before each part of the computation and while it waits for a slot.
 
         Raises:
@@ -195,7 +179,6 @@ class Engine:
 
     @kept(NEWEST, by=lambda task: task)
     def _augmented(self, task: str) -> AugmentedImitation:
-        """The augmented imitation of a task's demonstrations."""
         of = self.task(task)
         return fit_augmented(of.demonstrations, settings=AugmentedSettings(preparation=of.preparation))
 
@@ -268,7 +251,8 @@ class Engine:
         admission = self._admission(scenario, precision)
         found = None if admission.blocked else self._solved(scenario, admission.nominal, precision)
         if found is not None and not found.blocked:
-            self._last[scenario.task] = found
+            known = {name: last for name, last in self._last.items() if name in self.own or name in self._tasks}
+            self._last = known | {scenario.task: found}
             return Frame(scenario, Stage.ROLLOUTS, found, *self._drawn(found))
         blocked = admission.blocked if found is None else found.blocked
         free = replace(scenario, stack=_without_obstacles(scenario.stack))
@@ -356,6 +340,5 @@ class Engine:
 
 
 def _without_obstacles(stack: tuple[Layer, ...]) -> tuple[Layer, ...]:
-    """The stack with all that avoids switched off."""
     avoids = [isinstance(layer.transform, Avoidance) or bool(layer.transform.avoided.parts) for layer in stack]
     return tuple(replace(layer, on=layer.on and not off) for layer, off in zip(stack, avoids, strict=True))

@@ -19,11 +19,10 @@ from dt_viz.motion.certificates import Certificates, DrawnSamples
 from dt_viz.motion.following import ArmMotion
 from dt_viz.motion.profiles import Profiles
 from dt_viz.motion.solve import Solved
-from dt_viz.motion.stack import Applied
 from dt_viz.pictures.sketchbook import NO_PICTURES, Pictures, in_frame
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.slices import Slice
-from dt_viz.scenario.stack import levels
+from dt_viz.scenario.stack import WHOLE_ARM, levels
 from dt_viz.scenario.tasks import Task
 from dt_viz.warning import MotionWarning
 
@@ -202,7 +201,7 @@ class Frame:
     @property
     def labels(self) -> tuple[float, ...]:
         """Label of each demonstration; an added start may have one of them. None where no labels are needed."""
-        return self.motion.nominal.learned.demonstrated_labels
+        return self.motion.nominal.imitation.labels or ()
 
     @property
     def learned_steps(self) -> tuple[int, ...]:
@@ -211,21 +210,13 @@ class Frame:
         return () if flows is None else tuple(flow.steps for flow in flows.parts if isinstance(flow, Flow))
 
     @property
-    def durations(self) -> tuple[float | None, ...]:
-        """Flow time t of each layer of the stack, under a warp that of the full one; None where it is off."""
-        return tuple(applied.made.duration if applied else None for applied in self._layers)
+    def durations(self) -> Mapping[str, float]:
+        """Flow time t of each layer that is on, by its name, and of the whole arm; of the full one under a warp."""
+        found = {applied.name: applied.made.duration for applied in self.motion.stack.built}
+        return found if self.motion.arm is None else {**found, WHOLE_ARM: self.motion.arm.duration}
 
     @property
-    def chosen_values(self) -> tuple[Mapping[str, float], ...]:
-        """Values that each layer of the stack chose automatically, by its fields; none where it is off."""
-        return tuple(applied.made.chosen if applied else {} for applied in self._layers)
-
-    @property
-    def arm_duration(self) -> float | None:
-        """Flow time t by which the whole arm avoids, under a warp that of the full one; None where it does not."""
-        return self.motion.arm.duration if self.motion.arm else None
-
-    @property
-    def _layers(self) -> list[Applied | None]:
-        """The layers of the stack as they were made; None where they are off."""
-        return [self.motion.stack.at(place) for place in range(len(self.motion.scenario.stack))]
+    def chosen_values(self) -> Mapping[str, Mapping[str, float]]:
+        """Values that each of them chose automatically, by its name and their fields."""
+        found = {applied.name: applied.made.chosen for applied in self.motion.stack.built}
+        return found if self.motion.arm is None else {**found, WHOLE_ARM: {"duration": self.motion.arm.duration}}

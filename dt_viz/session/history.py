@@ -16,7 +16,6 @@ class History:
     """The scenarios before and after the present one. Whoever has it asks one thing at a time."""
 
     def __init__(self) -> None:
-        """Begin without a past."""
         self._past: deque[Scenario] = deque(maxlen=MAX_UNDO)
         self._future: list[Scenario] = []
         self._gesture: tuple[str, float] = ("", 0.0)

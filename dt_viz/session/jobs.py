@@ -31,15 +31,10 @@ class Jobs:
         """Whether the visitor has left."""
 
     def submit(self, lane: str, work: Work, *, latest: bool = False) -> int:
-        """Do work on a lane, after what it is doing; nothing is done once the visitor has left. Never blocks for long.
-
-        Args:
-            lane: name of the lane.
-            work: does it.
-            latest: whether to drop what waits on the lane, instead of doing that first.
+        """Do work on a lane, in turn or as its latest; nothing once the visitor has left. Never blocks for long.
 
         Returns:
-            Number of the works that were dropped.
+            Number of the works that waited and were dropped for the latest one.
         """
         with self._changed:
             if self.closed:  # a control that still moves while its page goes away

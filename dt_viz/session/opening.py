@@ -11,7 +11,7 @@ import numpy as np
 
 from dt_viz.errors import Cancelled, FormatError, never, parsing
 from dt_viz.files.columns import UNITS
-from dt_viz.files.recordings import Answers, Recordings, recordings_of, request
+from dt_viz.files.recordings import Answers, Recordings
 from dt_viz.files.takes import UNTIMED, Take, in_si_units
 from dt_viz.files.uploads import read_upload
 from dt_viz.flows.fields import Array
@@ -101,9 +101,7 @@ def read(
     """
     name = files[0][0] if len(files) == 1 else f"{len(files)} files"
     with parsing(DemonstrationError, name, "file", "recorded motions"):
-        content, options = request(files, answers, robot.joint_names)
-        arrays, _ = read_upload("takes", "recording", content, cancelled, options)
-        return recordings_of(arrays)
+        return read_upload(Recordings, files, cancelled, answers=answers, joint_names=[*robot.joint_names])
 
 
 def preview(recordings: Recordings, choices: Choices, robot: Robot) -> Preview:
@@ -158,7 +156,6 @@ def _moved(seen: Preview, fits: Placement) -> Preview:
 
 
 def _copied(take: Take) -> Take:
-    """A take whose units may be changed in place."""
     copies = {name: np.array(value) for name in ("positions", "joints") if (value := getattr(take, name)) is not None}
     return replace(take, **copies)
 

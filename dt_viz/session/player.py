@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Any
 
 from dt_viz.scenario.scenario import Scenario
@@ -31,27 +30,27 @@ def start(
         changed: called with True when playing begins and with False when it ends.
         returns: whether the motion is in the end as it was before, unless somebody else has changed it.
     """
-    session.jobs.submit(LANE, partial(_play, session, gesture, play, changed, returns), latest=True)
+
+    def work() -> None:
+        changed(True)
+        session.begin_gesture()
+        before, mine, began = session.scenario, None, time.monotonic()
+        while mine is None or session.scenario.choices == mine.choices:  # else the user edits something
+            changes = play(session.scenario, time.monotonic() - began)
+            if changes is not None:
+                session.edit(gesture, **changes)
+                mine = session.scenario
+                session.jobs.rest(LANE, STEP)
+            if changes is None or session.jobs.superseded(LANE):
+                if returns:
+                    session.edit(gesture, stack=before.stack)
+                session.end_gesture()
+                break
+        changed(False)
+
+    session.jobs.submit(LANE, work, latest=True)
 
 
 def stop(session: Session) -> None:
     """Stop what is played after the current edit."""
     session.jobs.submit(LANE, lambda: None, latest=True)
-
-
-def _play(session: Session, gesture: str, play: Play, changed: Callable[[bool], None], returns: bool) -> None:
-    changed(True)
-    session.begin_gesture()
-    before, mine, began = session.scenario, None, time.monotonic()
-    while mine is None or session.scenario.choices == mine.choices:  # else the user edits something
-        changes = play(session.scenario, time.monotonic() - began)
-        if changes is not None:
-            session.edit(gesture, **changes)
-            mine = session.scenario
-            session.jobs.rest(LANE, STEP)
-        if changes is None or session.jobs.superseded(LANE):
-            if returns:
-                session.edit(gesture, stack=before.stack)
-            session.end_gesture()
-            break
-    changed(False)

@@ -88,7 +88,6 @@ class Screen:
     """A display and what it shows: one thread after the other, so that the newest is shown last."""
 
     def __init__(self, display: Display, wanted: Scenario) -> None:
-        """Take the display; nothing is shown on it yet."""
         self._display = display
         self._adopting, self._telling = threading.RLock(), threading.RLock()
         self.progress = Progress(wanted)

@@ -56,12 +56,6 @@ class LiveArm:
     """
 
     def __init__(self, follower: Follower, settings: RoundSettings | None = None) -> None:
-        """Take an arm; it begins to move once it has something to follow.
-
-        Args:
-            follower: the arm.
-            settings: None are the defaults.
-        """
         self._follower = follower
         self._settings = sized(settings or RoundSettings(), follower.robot.size)
         self._changing = threading.Lock()

@@ -61,8 +61,8 @@ class Session:
 
         Args:
             engine: for the first arm, used by this session only.
-            initial: the scenario that a task of an engine begins with. It may raise what `Engine.task` raises.
-            task: the first task's name.
+            initial: makes the scenario that a task of an engine begins with; raises what `Engine.task` raises.
+            task: name of the first one.
             display: where results go.
             new_engine: makes engines for other arms; None if there are none.
         """
@@ -102,12 +102,10 @@ class Session:
         return self.engine.task(self.scenario.task)
 
     def edit(self, gesture: str, *, anew: bool = False, **changes: Any) -> None:  # noqa: ANN401 - the fields of Scenario
-        """Replace some values of the scenario and have it computed anew.
+        """Replace fields of the scenario, all but `passing`, and have it computed anew.
 
-        Args:
-            gesture: which control is being moved; edits by one control in quick succession are undone together.
-            anew: whether detours and reference posture are chosen anew, not kept from the motion that is shown.
-            **changes: fields of `Scenario`, without `passing`.
+        Edits by one gesture in quick succession are undone together. Detours and reference posture are those of the
+        motion that is shown, or chosen `anew`.
         """
         with self._lock:
             edited = _with_a_level_of_its_own(replace(self.scenario, **changes))
@@ -162,7 +160,7 @@ class Session:
 
     def bring(self, task: Task) -> tuple[Task, str | None]:
         """Take a task of the visitor's own, to be chosen; see `Engine.bring`."""
-        own, gone = self.engines.bring(task, self.scenario)
+        own, gone = self.engine.bring(task, self.scenario.task)
         if gone is not None:
             with self._lock:
                 self._history.forget(gone)
@@ -295,12 +293,10 @@ class Session:
         self._adopt()
 
     def _adopt(self) -> None:
-        """Show the newest scenario on the controls."""
         self._unadopted = False
         self._screen.adopt(lambda: self.scenario)
 
     def _catch_up(self) -> None:
-        """Show what a drag has edited."""
         if self._unadopted:
             self._adopt()
 

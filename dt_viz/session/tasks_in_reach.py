@@ -49,15 +49,7 @@ def _placed(entry: TaskEntry, robot: Robot) -> Task:
 
 
 def _freed(task: Task, robot: Robot, room: float = 0.01, step: float = 0.01, most: int = 20) -> Task:
-    """Return a task whose first obstacle does not touch the arm at the goal: it is moved away from that, step by step.
-
-    Args:
-        task: placed for the arm.
-        robot: the arm.
-        room: distance that is left, metres.
-        step: length of a step, metres.
-        most: largest number of steps.
-    """
+    """Return a task whose first obstacle has room, metres, from the arm at the goal: it is moved away in some steps."""
     goal, place = np.mean([path[-1] for path in task.paths], axis=0), np.array(task.obstacle_position)
     posture, arm = inverse_kinematics(robot, goal), WholeArm(robot)
     for k in range(most):

@@ -11,7 +11,9 @@ from typing import Any
 import viser
 
 from dt_viz.scenario.scenario import OFFERS, Scenario, View
+from dt_viz.session import player
 from dt_viz.session.frame import Frame
+from dt_viz.session.player import Play
 from dt_viz.session.session import Session
 from dt_viz.ui.controls import Control, on_command
 
@@ -19,11 +21,17 @@ KEEP: Any = object()
 """Value of a binding that leaves what is shown as it is."""
 EDITS = "edits"
 """Lane of the session's jobs for edits that take longer than the server's event loop may wait."""
+STOP = "Stop"
+Handle = Value = Any
+"""Handles of viser, and values of inputs, of all kinds."""
+Act = Callable[[Session, Value], object]
+Read = Callable[[Scenario], Value]
+"""Function of the adopted scenario; it may look at `Bindings.frame`, too."""
 
 
 @dataclass
 class _Binding:
-    read: Callable[[Scenario], Any]
+    read: Read
     put: Callable[[Any], None]
     last: Any = KEEP
     """Value that was read last."""
@@ -65,89 +73,100 @@ class Bindings:
         """Let the inputs act on this session."""
         self._session = session
 
-    def show(self, read: Callable[[Scenario], Any], put: Callable[[Any], None]) -> None:
+    def show(self, read: Read, put: Callable[[Any], None]) -> None:
         """Call `put` with each new value that `read` gives."""
         self._bindings.append(_Binding(read, put))
 
-    def properties(self, handle: Any, **read: Callable[[Scenario], Any]) -> None:  # noqa: ANN401 - handles of all kinds
-        """Assign the properties of a handle what their functions read."""
+    def properties(self, handle: Handle, **read: Read) -> Handle:
+        """Assign the properties of a handle, which is returned, what their functions read."""
         for name, value in read.items():
             self.show(value, partial(setattr, handle, name))
+        return handle
 
     def input(
         self,
-        handle: Any,  # noqa: ANN401
-        read: Callable[[Scenario], Any],
+        handle: Handle,
+        read: Read,
         change: Callable[[Scenario, Any], Mapping[str, Any]],
+        **properties: Read,
     ) -> Control:
         """Bind an input: `read` gives its value, `change` the fields of the scenario that a new value replaces."""
-        return self.choice(
-            handle, read, lambda session, value: session.edit(handle.label, **change(session.scenario, value))
-        )
 
-    def field(self, handle: Any, name: str) -> Control:  # noqa: ANN401
+        def edit(session: Session, value: Value) -> None:
+            session.edit(handle.label, **change(session.scenario, value))
+
+        return self.choice(handle, read, edit, **properties)
+
+    def field(self, handle: Handle, name: str, **properties: Read) -> Control:
         """Bind an input to a field of the scenario."""
-        return self.input(handle, lambda s: getattr(s, name), lambda _s, value: {name: value})
+        return self.input(handle, lambda s: getattr(s, name), lambda _s, value: {name: value}, **properties)
 
     def view(
         self,
-        handle: Any,  # noqa: ANN401
+        handle: Handle,
         name: str,
-        shown: Callable[[Any], Any] = lambda value: value,
-        meant: Callable[[Any], Any] = lambda value: value,
+        shown: Callable[[Value], Value] = lambda value: value,
+        meant: Callable[[Value], Value] = lambda value: value,
+        **properties: Read,
     ) -> Control:
         """Bind an input to a field of `View`: `shown` is its value for the field's, `meant` the field's for its own."""
         return self.input(
             handle,
             lambda s: shown(getattr(s.view, name)),
             lambda s, value: {"view": replace(s.view, **{name: meant(value)})},
+            **properties,
         )
 
-    def checkbox(self, gui: viser.GuiApi, name: str, **options: Any) -> Control:  # noqa: ANN401
-        """Add the checkbox of a field of `View` where the panel is being built; the options are viser's."""
-        handle = gui.add_checkbox(OFFERS[name].label, bool(getattr(View(), name)), hint=OFFERS[name].hint, **options)
-        return self.view(handle, name, bool)
+    def checkbox(self, gui: viser.GuiApi, name: str, **properties: Read) -> Control:
+        """Add the checkbox of a field of `View` where the panel is being built."""
+        offer, shown = OFFERS[name], "visible" not in properties
+        handle = gui.add_checkbox(offer.label, bool(getattr(View(), name)), hint=offer.hint, visible=shown)
+        return self.view(handle, name, bool, **properties)
 
-    def slider(
-        self,
-        gui: viser.GuiApi,
-        name: str,
-        low: float,
-        high: float,
-        step: float,
-        **options: Any,  # noqa: ANN401
-    ) -> Any:  # noqa: ANN401 - viser's handle
-        """Add the slider of a field of `View` likewise, and return its handle."""
-        initial = getattr(View(), name)
-        handle = gui.add_slider(OFFERS[name].label, low, high, step, initial, hint=OFFERS[name].hint, **options)
-        self.view(handle, name, meant=type(initial))
-        return handle
+    def slider(self, gui: viser.GuiApi, name: str, **properties: Read) -> Control:
+        """Add the slider of a field of `View` likewise."""
+        offer, initial, shown = OFFERS[name], getattr(View(), name), "visible" not in properties
+        handle = gui.add_slider(offer.label, *offer.limits, initial, hint=offer.hint, visible=shown)
+        return self.view(handle, name, meant=type(initial), **properties)
 
-    def choice(
-        self,
-        handle: Any,  # noqa: ANN401
-        read: Callable[[Scenario], Any],
-        act: Callable[[Session, Any], None],
-    ) -> Control:
+    def choice(self, handle: Handle, read: Read, act: Act, **properties: Read) -> Control:
         """Bind an input whose new values do more than to edit the scenario."""
-        control = self.on(handle, act)
-        self.properties(control, value=read)
-        return control
+        self.properties(handle, **properties)
+        return self.properties(self.on(handle, act), value=read)
 
-    def on(self, handle: Any, act: Callable[[Session, Any], object]) -> Control:  # noqa: ANN401
+    def on(self, handle: Handle, act: Act, **properties: Read) -> Control:
         """Call `act`, which must only submit, with each new value of an input, or press of a button."""
 
-        def acts(value: Any) -> None:  # noqa: ANN401
+        def acts(value: Value) -> None:
             if self._session is not None:
                 act(self._session, value)
 
-        return Control(handle, acts)
+        return Control(self.properties(handle, **properties), acts)
 
-    def later(self, handle: Any, act: Callable[[Session, Any], None]) -> Control:  # noqa: ANN401
+    def later(self, handle: Handle, act: Act, **properties: Read) -> Control:
         """Do `act` with each press of a button, one after the other, beside the server's event loop."""
-        return self.on(handle, lambda session, value: session.jobs.submit(EDITS, partial(act, session, value)))
+        edits = lambda session, value: session.jobs.submit(EDITS, partial(act, session, value))  # noqa: E731
+        return self.on(handle, edits, **properties)
 
-    def on_command(self, command: Any, act: Callable[[Session], None]) -> None:  # noqa: ANN401
+    def plays(
+        self, buttons: Handle, gesture: str, chosen: Callable[[Session, str], Play | None], *, returns: bool = False
+    ) -> None:
+        """Play what is `chosen` by a button of a group, which is one that stops it meanwhile; see `player.start`."""
+        options = buttons.options
+
+        def show(playing: bool) -> None:
+            buttons.options = (STOP,) if playing else options
+
+        def press(session: Session, button: str) -> None:
+            play = None if button == STOP else chosen(session, button)
+            if play is None:
+                player.stop(session)
+            else:
+                player.start(session, gesture, play, show, returns=returns)
+
+        self.on(buttons, press)
+
+    def on_command(self, command: Handle, act: Callable[[Session], None]) -> None:
         """Call `act`, which must only submit, when a command of the palette is given."""
         on_command(command, lambda: act(self._session) if self._session is not None else None)
 

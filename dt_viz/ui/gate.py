@@ -5,7 +5,7 @@ package websockets; the gate is inserted there, so that it sees each request bef
 before viser decodes it:
 
 - Requests must be meant for this server, and connections come from its own or allowed pages; see `Origins`. The number
-  of connections is limited. Answers say what the page may load and who may embed it.
+  of connections is limited, in all and for each address. Answers say what the page may load and who may embed it.
 - Messages of the kinds that this page uses are passed on, if they are exactly as viser declares them. Other kinds are
   dropped: some would be stored and sent to everybody (a form that changes), and some request what no visitor may decide
   (a tunnel to the internet). A malformed message ends its connection.
@@ -33,16 +33,23 @@ from websockets.http11 import Request, Response
 
 from dt_viz.errors import DataError, naming
 from dt_viz.files.checks import check_size
-from dt_viz.ui import patches, ruler
-from dt_viz.ui.origins import Origins
+from dt_viz.ui import patches, scripts
+from dt_viz.ui.origins import Origins, address_of
 
 logger = logging.getLogger(__name__)
 
-MISDIRECTED = (
-    "This server is not known by that name. To use it, start it with --allow-origin and the address of the page."
+Refusal = tuple[HTTPStatus, str]
+"""Status of the answer to a request that is refused, and what it says."""
+MISDIRECTED: Refusal = (
+    HTTPStatus.MISDIRECTED_REQUEST,
+    "This server is not known by that name. To use it, start it with --allow-origin and the address of the page.",
 )
-FOREIGN = "Pages of other servers may not connect. To let one, start this server with --allow-origin and its address."
-FULL = "All places are taken, and those to wait, too."
+FOREIGN: Refusal = (
+    HTTPStatus.FORBIDDEN,
+    "Pages of other servers may not connect. To let one, start this server with --allow-origin and its address.",
+)
+FULL: Refusal = HTTPStatus.SERVICE_UNAVAILABLE, "All places are taken, and those to wait, too."
+CROWDED: Refusal = HTTPStatus.TOO_MANY_REQUESTS, "Too many pages are open from your address. Close one of them."
 KINDS: Mapping[str, str] = {
     "ViewerCameraMessage": "message",
     "GuiUpdateMessage": "message",
@@ -73,6 +80,8 @@ class Limits:
     """Largest number of simultaneous connections."""
     upload: int
     """Largest size of a file, bytes."""
+    of_address: int = 8
+    """Largest number of connections of one `address_of`."""
     sockets: int = 256
     """Largest number of open sockets, with or without a request."""
     rate: float = 400.0
@@ -199,7 +208,7 @@ class Gate:
         origins: Origins,
         limits: Limits,
         refused: Refused,
-        measured: ruler.Measured = lambda _token, _width: None,
+        measured: scripts.Measured = lambda _token, _width: None,
     ) -> None:
         """Prepare the checks.
 
@@ -214,7 +223,13 @@ class Gate:
         """
         self.limits = limits
         self._origins, self._refused, self._measured = origins, refused, measured
-        self._connections: set[ServerConnection] = set()
+        self._connections: dict[ServerConnection, str] = {}
+        """The connections, and the address of each."""
+        self._headers = {
+            "Content-Security-Policy": origins.policy,
+            "X-Content-Type-Options": "nosniff",
+            "Referrer-Policy": "no-referrer",
+        }
         self._server: viser.ViserServer | None = None
         self._protocol = f"viser-v{viser.__version__}"
         try:
@@ -243,30 +258,34 @@ class Gate:
         }
 
     def _answer(self, answer: Answer, connection: ServerConnection, request: Request) -> Response | None:
-        hosts = request.headers.get_all("Host")
-        if len(hosts) != 1 or not self._origins.knows(hosts[0]):
-            logger.warning("a request under a foreign name was refused; --allow-origin lets a name be used")
-            return connection.respond(HTTPStatus.MISDIRECTED_REQUEST, MISDIRECTED)
-        if "websocket" in ",".join(request.headers.get_all("Upgrade")).lower():
-            origins = request.headers.get_all("Origin")  # none: no browser
-            if len(origins) > 1 or (origins and not self._origins.admits(origins[0], hosts[0])):
-                logger.warning("a page of another server was refused; --allow-origin lets it connect")
-                return connection.respond(HTTPStatus.FORBIDDEN, FOREIGN)
-            if len(self._connections) >= self.limits.connections:
-                logger.warning("a connection was refused: there are %d", len(self._connections))
-                return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, FULL)
-            self._connections.add(connection)
-        elif (told := ruler.told(request.path)) is not None:
+        refusal = self._refusal(connection, request)
+        if refusal is not None:
+            logger.warning("a request was refused: %s", refusal[1])
+            return connection.respond(*refusal)
+        if (told := scripts.told(request.path)) is not None:
             self._measured(*told)
-            response = connection.respond(HTTPStatus.NO_CONTENT, "")
-            response.headers["Cache-Control"] = "no-store"  # so that it is asked for each time
-            return response
+            return connection.respond(HTTPStatus.NO_CONTENT, "")
         response = answer(connection, request)
         if response is not None:
-            response.headers["Content-Security-Policy"] = self._origins.policy
-            response.headers["X-Content-Type-Options"] = "nosniff"
-            response.headers["Referrer-Policy"] = "no-referrer"
+            response.headers.update(self._headers)
         return response
+
+    def _refusal(self, connection: ServerConnection, request: Request) -> Refusal | None:
+        """Return why a request is refused; None takes it, and counts it if it asks for a connection."""
+        hosts, origins, upgrades = (request.headers.get_all(name) for name in ("Host", "Origin", "Upgrade"))
+        if len(hosts) != 1 or not self._origins.knows(hosts[0]):
+            return MISDIRECTED
+        if "websocket" not in ",".join(upgrades).lower():
+            return None
+        if len(origins) > 1 or (origins and not self._origins.admits(origins[0], hosts[0])):  # none: no browser
+            return FOREIGN
+        if len(self._connections) >= self.limits.connections:
+            return FULL
+        address = address_of(connection.remote_address[0], request.headers.get_all("X-Forwarded-For"))
+        if address and list(self._connections.values()).count(address) >= self.limits.of_address:
+            return CROWDED
+        self._connections[connection] = address
+        return None
 
     async def _handle(self, handler: Callable[[ServerConnection], Any], connection: ServerConnection) -> None:
         if connection.subprotocol == self._protocol:
@@ -276,7 +295,7 @@ class Gate:
 
     def leave(self, connection: ServerConnection) -> None:
         """Forget a lost connection."""
-        self._connections.discard(connection)
+        self._connections.pop(connection, None)
 
     def passes(self, connection: _Connection, raw: Any) -> bool:  # noqa: ANN401 - bytes, or what no page sends
         """Return whether a message is passed on to viser.

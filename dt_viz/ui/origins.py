@@ -105,6 +105,22 @@ class Origins:
         return (_canonical(page.host), page.port) == (_canonical(parts.hostname), port)
 
 
+def address_of(peer: str, forwarded: Iterable[str]) -> str:
+    """Return the address, of IPv6 the network, that a request is counted for; empty for this machine's own.
+
+    Args:
+        peer: the other end of the connection.
+        forwarded: values of the header ``X-Forwarded-For``, to which a proxy adds who has connected to it. Only one on
+            this machine is believed: anybody may send the header.
+    """
+    address = _address(peer)
+    if address is not None and address.is_loopback:
+        address = _address(",".join(forwarded).rpartition(",")[2].strip())
+    if address is None or address.is_loopback:
+        return ""
+    return str(ipaddress.ip_network((address, 64 if address.version == 6 else 32), strict=False))
+
+
 def _split(text: str) -> SplitResult | None:
     """Split a URL; return None if it has no host, an invalid port, or further parts."""
     try:

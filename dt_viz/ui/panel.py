@@ -27,7 +27,7 @@ from dt_viz.ui.tabs.about import Command, add_about, add_commands, numbered
 from dt_viz.ui.tabs.arm import add_arm, play_or_pause
 from dt_viz.ui.tabs.compare import ComparePanel
 from dt_viz.ui.tabs.opening import OpenPanel, Show
-from dt_viz.ui.tabs.picture import BigType, PictureTab, Presentation
+from dt_viz.ui.tabs.picture import PictureTab, Presentation, big_type
 from dt_viz.ui.tabs.show import ShowTab
 from dt_viz.ui.tabs.stack import StackPanel
 from dt_viz.ui.tabs.status import COLOURS, StatusLine, hint, hint_html, sentence
@@ -57,26 +57,14 @@ class ControlPanel:
         darken: Callable[[bool], None],
         preview: Show = lambda _seen, _number: None,
     ) -> None:
-        """Build the controls; they act once `connect` has given them a session.
-
-        Args:
-            gui: controls of the visitor.
-            titles: titles of the tasks, by name.
-            robot: the first arm.
-            arms: titles of the arms that may be chosen, by their names.
-            save_png: makes a picture, given the resolution's name and whether it is transparent.
-            notify: shows a text in a colour beside the panel, however far that is scrolled.
-            tripod: stand of the visitor's camera.
-            darken: begins the dark theme, or the light one.
-            preview: shows takes that are open in the scene.
-        """
+        """Build the controls, for the titles of tasks and arms by name; they act once `connect` has given a session."""
         self._notify, self._tripod, self._titles = notify, tripod, dict(titles)
         self._notified: Message | None = None
         self._scenes = {scene.title: scene for scene in offered(self._titles)}
         self.bindings = bindings = Bindings()
         self.presentation = Presentation(gui, self._turn, lambda alone: tripod.reframe(alone=alone))
-        bindings.show(self._title, self.presentation.entitle)
-        big = BigType(gui, tripod)
+        bindings.show(self._title, lambda title: self.presentation.write(title=title))
+        enlarge = big_type(gui, tripod)
         self._scene = self._add_choices(gui, preview)
         self.hint = gui.add_html(hint_html(""))
         add_avoid_and_imitate(gui, bindings)
@@ -97,7 +85,7 @@ class ControlPanel:
         with tabs.add_tab("Compare"):
             self._compare = ComparePanel(gui, bindings)
         with tabs.add_tab("Picture"):
-            act = {"darken": darken, "enlarge": big.show, "save_png": save_png}
+            act = {"darken": darken, "enlarge": enlarge, "save_png": save_png}
             picture = PictureTab(gui, bindings, tripod, self.presentation, **act)
         commands = self._commands(gui.main_panel, picture)
         add_commands(gui, bindings, commands)
@@ -118,7 +106,7 @@ class ControlPanel:
     @property
     def legend(self) -> Legend | None:
         """Legend of the colours on the slice."""
-        return self.show.slice.legend
+        return self.show.legend
 
     def adopt(self, scenario: Scenario) -> None:
         """Show the scenario's choices."""
@@ -135,16 +123,13 @@ class ControlPanel:
     def tell(self, progress: Progress) -> None:
         """Show the verdict on what is shown, its hint, and a message, which is for a while beside the panel, too."""
         self.status.tell(progress)
-        self.give_hint("" if progress.shown is None or progress.stale else hint(progress.shown))
+        text = "" if progress.shown is None or progress.stale else hint(progress.shown)
+        self.hint.content = hint_html(text)
+        self.presentation.write(caption=text)
         message = progress.message
         if message is not None and message is not self._notified:
             self._notify(sentence(message.text), COLOURS[message.severity][0])
         self._notified = message
-
-    def give_hint(self, text: str) -> None:
-        """Show a hint in the panel, and as the caption of the presentation."""
-        self.hint.content = hint_html(text)
-        self.presentation.caption(text)
 
     def _add_choices(self, gui: viser.GuiApi, preview: Show) -> Control:
         """Add the dropdowns of tasks and scenes, and what opens recordings; return that of the scenes."""
@@ -163,7 +148,6 @@ class ControlPanel:
         )
 
     def _learn(self, session: Session, task: Task) -> None:
-        """Begin with a task of the visitor's own."""
 
         def begin(session: Session, _title: str) -> None:
             own, gone = session.bring(task)
@@ -220,8 +204,8 @@ class ControlPanel:
         return [
             Command("Pause, or play", play_or_pause, "space"),
             Command("Reset the scene and the camera", lambda session: self._travel(session, "Reset"), "R"),
-            Command("Undo", lambda session: self._travel(session, "Undo"), "Z"),
-            Command("Redo", lambda session: self._travel(session, "Redo"), "Z", shifted=True),
+            Command("Undo", Session.undo, "Z"),
+            Command("Redo", Session.redo, "Z", shifted=True),
             *picture.commands,
             Command("Hide the panel, or show it", fold, "H"),
             *self.presentation.commands,

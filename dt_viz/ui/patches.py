@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import viser
 import viser._messages
 import viser._scene_api
@@ -113,3 +114,12 @@ def put_back(handle: Any, value: Any, *, shown: bool) -> None:  # noqa: ANN401
     handle._impl.value = value
     if shown:
         handle._queue_update("value", value)
+
+
+def put_back_pose(gizmo: viser.TransformControlsHandle, position: Any, wxyz: Any) -> None:  # noqa: ANN401
+    """Show a pose in the browser, also where it was assigned last. Hook: a handler that may refuse a pose.
+
+    viser stores whatever the browser sent, and skips values that it has already.
+    """
+    gizmo._impl.position, gizmo._impl.wxyz = np.full(3, np.nan), np.full(4, np.nan)
+    gizmo.position, gizmo.wxyz = position, wxyz

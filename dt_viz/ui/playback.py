@@ -70,12 +70,7 @@ class Playback:
     """Moves the arm, beside the server's event loop, and has it drawn where it is another one than before."""
 
     def __init__(self, live: LiveArm, draw: Callable[[], None]) -> None:
-        """Take an arm; it moves from `begin` on.
-
-        Args:
-            live: the arm in the loop.
-            draw: draws the arm in its posture.
-        """
+        """Take the arm in the loop, and what draws it; it moves from `begin` on."""
         self.live, self.replay = live, Replay()
         self.arm: LiveArm | Replay = live
         """What moves now, with its joint angles `q` and `undisturbed`, (n,), rad, and the time since it `arrived`."""
@@ -83,22 +78,11 @@ class Playback:
         self._playing, self._speed = True, 1.0
 
     def begin(self, jobs: Jobs, fail: Callable[[Exception], None]) -> None:
-        """Move the arm from now on, until the jobs are closed.
-
-        Args:
-            jobs: jobs of the visitor.
-            fail: called with what keeps the arm in the loop from moving; it waits for its next motion then.
-        """
+        """Move the arm until the jobs are closed; `fail` is told what stops it until its next motion."""
         jobs.submit(LANE, partial(self._loop, jobs, fail))
 
     def play(self, playing: bool, speed: float, *, replays: bool) -> None:
-        """Choose how the arm moves.
-
-        Args:
-            playing: whether it does so by itself.
-            speed: its time, relative to real time.
-            replays: whether it repeats its motion; when it does so no more, it goes on from where it is.
-        """
+        """Choose whether and how fast the arm moves, and whether it repeats its motion; later it goes on from there."""
         left = self.arm.q
         if self.arm is self.replay and not replays and left is not None:
             self.live.put(left)

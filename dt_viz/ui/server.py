@@ -81,9 +81,9 @@ class Server:
         self._num_building = 0
         """Number of pages that are being built, also for visitors who have left meanwhile."""
         self._closed = False
-        self.gate = Gate(
-            Origins(host, allowed), Limits(max_sessions + max_waiting, upload=MAX_UPLOAD), _refuse, self._measured
-        )
+        places = max_sessions + max_waiting
+        limits = Limits(places, upload=MAX_UPLOAD, of_address=max(2, places // 2))
+        self.gate = Gate(Origins(host, allowed), limits, _refuse, self._measured)
         self._server = self.gate.open(host, port, "DT-Viz")
         if self._server.get_port() != port:  # another program was faster than the check
             self._server.stop()

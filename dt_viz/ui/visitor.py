@@ -24,12 +24,12 @@ from dt_viz.session.progress import Display, Pace, Progress
 from dt_viz.session.session import Session
 from dt_viz.ui.panel import ControlPanel
 from dt_viz.ui.playback import Playback
-from dt_viz.ui.ruler import Ruler
 from dt_viz.ui.scene.camera import CameraController
 from dt_viz.ui.scene.export import RESOLUTIONS, render_png
 from dt_viz.ui.scene.palette import DARK, LIGHT, Colour, Theme
 from dt_viz.ui.scene.robot_scene import RobotScene
 from dt_viz.ui.scene.scene import ScenePictures
+from dt_viz.ui.scripts import Ruler
 
 
 def initial_scenario(engine: Engine, name: str) -> Scenario:
@@ -56,16 +56,7 @@ class Visitor(Display):
         task: str,
         arms: ArmStore | None = None,
     ) -> None:
-        """Build the page and start computing.
-
-        Args:
-            client: connection of the visitor.
-            engine: engine of this visitor only.
-            robot: the first arm.
-            titles: titles of the tasks, by name.
-            task: name of the first task.
-            arms: arms to choose from; None is the first one alone.
-        """
+        """Build the page for an engine of its own and start computing; there is one arm where there are no `arms`."""
         self.client = client
         self.shown: Frame | None = None
         """The last drawn frame."""
@@ -102,7 +93,7 @@ class Visitor(Display):
         self.client.gui.add_html(self.ruler.html)
 
     def measured(self, width: float) -> None:
-        """Take the width that the window has at least, CSS pixels."""
+        """Take the width of the window, CSS pixels."""
         self._camera.measured(width)
 
     def draw(self, frame: Frame, pace: Pace) -> None:
@@ -153,7 +144,6 @@ class Visitor(Display):
         self.client.flush()
 
     def _pose(self) -> None:
-        """Draw the scene a moment later."""
         now = time.monotonic()
         self._camera.turn(now)
         with self._exchanging:
@@ -175,7 +165,6 @@ class Visitor(Display):
         self._camera.reframe(arm_size=robot.size)
 
     def _dress(self, theme: Theme) -> None:
-        """Show the panel in a theme."""
         self._theme = theme
         self.client.gui.configure_theme(
             dark_mode=theme is DARK, show_logo=False, show_share_button=False, brand_color=LIGHT.brand
@@ -187,7 +176,6 @@ class Visitor(Display):
         self._paint(self._theme)
 
     def _paint(self, theme: Theme) -> None:
-        """Show the scene in a theme."""
         with self.client.atomic(), self._exchanging:
             self.pictures.paint(theme)
             self.robot.paint(theme)

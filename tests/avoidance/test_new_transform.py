@@ -37,7 +37,7 @@ def test_a_new_transform_needs_a_file_and_a_line(engine, scenario):
         assert np.isfinite(path).all()
         np.testing.assert_allclose(path[0], before[0], atol=1e-6)
         np.testing.assert_allclose(path[-1], frame.goal, atol=1e-3)
-    assert dict(zip([layer.name for layer in scenario.stack], frame.durations, strict=True))["Twirl 1"] == 0.8
+    assert frame.durations["Twirl 1"] == 0.8
     assert frame.certificates.min_det_jacobian > 0
     assert frame.certificates.round_trip_error < 1e-6
     assert frame.certificates.lyapunov_falls

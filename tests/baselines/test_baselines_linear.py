@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from plans import joints_of
 
-from dt_viz.baselines.linear import Linear
+from dt_viz.baselines import linear
 from dt_viz.baselines.postures import PlanningScene, Query, planned
 from dt_viz.obstacles.shapes import Box, Sphere, as_point
 from dt_viz.obstacles.union import Union
@@ -14,7 +14,7 @@ from dt_viz.robot.models import load_jaco
 
 
 def test_joints_go_straight_from_the_demonstrated_start_to_the_demonstrated_goal(problem):
-    plan = Linear().fit(problem).plan(Union(), problem.task.starts)
+    plan = linear.fit(problem)(Union(), problem.task.starts)
     for i, (q, t) in enumerate(zip(joints_of(plan), plan.times, strict=True)):
         start, goal = problem.postures[i][[0, -1]]
         np.testing.assert_allclose(q, start + np.linspace(0, 1, len(q))[:, None] * (goal - start), atol=1e-9)
@@ -25,7 +25,7 @@ def test_joints_go_straight_from_the_demonstrated_start_to_the_demonstrated_goal
 
 def test_another_start_is_reached_by_inverse_kinematics_near_the_nearest_demonstration(problem):
     start = problem.task.starts[2] + np.array([0.0005, 0.001, 0.001])
-    plan = Linear().fit(problem).plan(Union(), start[None])
+    plan = linear.fit(problem)(Union(), start[None])
     np.testing.assert_allclose(plan.paths[0][0], start, atol=1e-4)
     assert np.abs(joints_of(plan)[0][0] - problem.postures[2][0]).max() < 0.03
     np.testing.assert_array_equal(joints_of(plan)[0][-1], problem.postures[2][-1])
@@ -33,14 +33,14 @@ def test_another_start_is_reached_by_inverse_kinematics_near_the_nearest_demonst
 
 def test_a_start_out_of_reach_is_refused(problem):
     with pytest.raises(UnreachableError):
-        Linear().fit(problem).plan(Union(), np.array([[2.0, 0.0, 0.5]]))
+        linear.fit(problem)(Union(), np.array([[2.0, 0.0, 0.5]]))
 
 
 def test_an_obstacle_changes_nothing(problem):
-    planner, start = Linear().fit(problem), problem.task.starts[:1]
-    free = planner.plan(Union(), start)
+    planner, start = linear.fit(problem), problem.task.starts[:1]
+    free = planner(Union(), start)
     ball = Union((Sphere(as_point(free.paths[0][100]), 0.15),))
-    np.testing.assert_array_equal(joints_of(free)[0], joints_of(planner.plan(ball, start))[0])
+    np.testing.assert_array_equal(joints_of(free)[0], joints_of(planner(ball, start))[0])
 
 
 def test_corners_are_kept_and_joints_stay_within_their_velocity_limits(problem):
@@ -82,7 +82,7 @@ class TestSurroundings:
     def test_a_line_is_free_only_where_no_vertex_of_the_meshes_enters_anything(self, problem, lines, shape):
         place = as_point(problem.task.mean_path[50])
         part = Sphere(place, 0.15) if shape == "sphere" else Box(place, (0.1, 0.2, 0.12))
-        around = PlanningScene.of(problem.robot, Union((part,)))
+        around = PlanningScene(problem.robot, Union((part,)))
         verdicts = []
         for line in lines[:30]:
             verdicts.append(around.is_free(*line))
@@ -92,7 +92,7 @@ class TestSurroundings:
 
     def test_what_is_far_from_everything_is_free(self, problem, lines):
         model = load_jaco().collision
-        far, nothing = (PlanningScene.of(problem.robot, Union(parts)) for parts in ((Sphere((5.0, 0.0, 0.0)),), ()))
+        far, nothing = (PlanningScene(problem.robot, Union(parts)) for parts in ((Sphere((5.0, 0.0, 0.0)),), ()))
         for line in lines[:15]:
             itself = model.nearest_to_itself(np.stack(line))
             assert far.is_free(*line) == nothing.is_free(*line)
@@ -100,7 +100,7 @@ class TestSurroundings:
                 assert nothing.is_free(*line)
 
     def test_nothing_between_two_samples_is_passed_through(self, problem, lines):
-        free = [line for line in lines if PlanningScene.of(problem.robot, Union()).is_free(*line)]
+        free = [line for line in lines if PlanningScene(problem.robot, Union()).is_free(*line)]
         assert len(free) > 10
         rng, mesh = np.random.default_rng(2), load_jaco().meshes[-1]
         for start, end in free[:15]:
@@ -108,10 +108,10 @@ class TestSurroundings:
             vertex = mesh.vertices[rng.integers(len(mesh.vertices))]
             place = poses.rotations[0, mesh.joint + 1] @ vertex + poses.origins[0, mesh.joint + 1]
             speck = Union((Sphere(as_point(place), 0.0005),))
-            assert not PlanningScene.of(problem.robot, speck).is_free(start, end)
+            assert not PlanningScene(problem.robot, speck).is_free(start, end)
 
     def test_the_arm_may_not_pass_through_itself_or_the_table(self, problem):
-        nothing, model, rng = PlanningScene.of(problem.robot, Union()), load_jaco().collision, np.random.default_rng(1)
+        nothing, model, rng = PlanningScene(problem.robot, Union()), load_jaco().collision, np.random.default_rng(1)
         seen = set()
         for q in problem.robot.clip(rng.uniform(-np.pi, np.pi, size=(40, 6)) + problem.robot.home):
             report = model.report(q[None], Union())

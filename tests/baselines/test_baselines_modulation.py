@@ -5,7 +5,7 @@ import pytest
 from oracles import stepped
 
 from dt_viz.baselines.base import NotFittedError
-from dt_viz.baselines.modulation import Modulation, ModulationSettings, modulated
+from dt_viz.baselines.modulation import ModulationSettings, fit, modulated
 from dt_viz.baselines.registry import problem_of
 from dt_viz.metrics import distance_from_path
 from dt_viz.obstacles.shapes import Box, Cylinder, Sphere, as_point
@@ -35,16 +35,16 @@ def test_on_the_surface_nothing_flows_into_the_obstacle_and_far_away_the_velocit
     y, rng = on_surface(obstacle), np.random.default_rng(1)
     v, normal = rng.normal(size=y.shape), obstacle.distance_and_normal(y)[1]
     assert len(y) > 100
-    inward, before = (-np.einsum("nd,nd->n", normal, u) for u in (modulated(obstacle, y, v)[0], v))
+    inward, before = (-np.einsum("nd,nd->n", normal, u) for u in (modulated(obstacle, y, v), v))
     assert inward.max() < 1e-6 and before.max() > 0.5
-    assert np.abs(modulated(obstacle, 1000 * y, v)[0] - v).max() < 1e-4 * np.abs(v).max()
+    assert np.abs(modulated(obstacle, 1000 * y, v) - v).max() < 1e-4 * np.abs(v).max()
 
 
 def test_where_it_leads_away_the_radial_velocity_stays_and_without_an_obstacle_all_of_it():
     y = on_surface(SPHERE)
     away = 0.1 * SPHERE.distance_and_normal(y)[1]
-    np.testing.assert_allclose(modulated(SPHERE, y, away)[0], away, rtol=1e-5)
-    assert modulated(Union(), y, away)[0] is away
+    np.testing.assert_allclose(modulated(SPHERE, y, away), away, rtol=1e-5)
+    assert modulated(Union(), y, away) is away
 
 
 @pytest.fixture(scope="module")
@@ -55,11 +55,11 @@ def in_the_way(problem):
 
 def test_motions_are_those_of_the_modulated_velocity_reach_the_goal_and_stay_outside(problem, in_the_way):
     start, system = problem.task.starts[:1], problem.learned.system
-    plan = Modulation(ModulationSettings(tolerance=1e-4)).fit(problem).plan(in_the_way, start)
+    plan = fit(problem, ModulationSettings(tolerance=1e-4))(in_the_way, start)
     (path,), (times,) = plan.paths, plan.times
     some = np.linspace(0, 0.6 * times[-1], 16)
     at = np.stack([np.interp(some, times, axis) for axis in path.T], axis=1)
-    oracle = stepped(lambda y: modulated(in_the_way, y, system.velocity(y))[0], start, some, 5)[0]
+    oracle = stepped(lambda y: modulated(in_the_way, y, system.velocity(y)), start, some, 5)[0]
     assert np.linalg.norm(at - oracle, axis=1).max() < 3e-3
     assert np.linalg.norm(at - system.rollout(start[0], some), axis=1).max() > 0.02  # it is not the imitation
     assert np.linalg.norm(path[-1] - problem.learned.goal) < 1e-6
@@ -68,7 +68,7 @@ def test_motions_are_those_of_the_modulated_velocity_reach_the_goal_and_stay_out
 
 
 def test_without_an_obstacle_the_motions_are_the_imitation(problem):
-    plan = Modulation(ModulationSettings(tolerance=1e-4)).fit(problem).plan(Union(), problem.task.starts)
+    plan = fit(problem, ModulationSettings(tolerance=1e-4))(Union(), problem.task.starts)
     for path, times in zip(plan.paths, plan.times, strict=True):
         exact = problem.learned.system.rollout(path[0], times[:-1])
         assert np.linalg.norm(path[:-1] - exact, axis=1).max() < 5e-3
@@ -76,21 +76,19 @@ def test_without_an_obstacle_the_motions_are_the_imitation(problem):
 
 def test_on_the_page_it_stays_near_the_motion_that_is_exact(problem, in_the_way):
     start = problem.task.starts[:1]
-    (quick,), (exact,) = (
-        Modulation(s).fit(problem).plan(in_the_way, start).paths for s in (None, ModulationSettings(tolerance=1e-5))
-    )
+    (quick,), (exact,) = (fit(problem, s)(in_the_way, start).paths for s in (None, ModulationSettings(tolerance=1e-5)))
     assert distance_from_path(quick, exact).max() < 0.01
 
 
 def test_a_task_in_augmented_states_is_refused_by_one_line(engine):
     drawn = problem_of(engine.nominal(Scenario("draw_8")).learned, engine.follower)
     with pytest.raises(NotFittedError, match="augmented"):
-        Modulation().fit(drawn)
+        fit(drawn)
 
 
 def test_a_motion_straight_at_the_centre_stops_before_the_obstacle(problem):
     start = problem.task.starts[:1]
     direction = problem.learned.system.velocity(start)[0]
     obstacle = Union((Sphere(as_point(start[0] + 0.09 * direction / np.linalg.norm(direction)), 0.15),))
-    (path,) = Modulation().fit(problem).plan(obstacle, start).paths
+    (path,) = fit(problem)(obstacle, start).paths
     assert obstacle.signed_distance(path).min() > -1e-3

@@ -11,17 +11,16 @@ import pytest
 from other_arms import OTHER_ARMS
 from plans import joints_of
 
+from dt_viz.baselines import linear, mpnet, mpnet_rrt
 from dt_viz.baselines.base import NotFittedError
-from dt_viz.baselines.linear import Linear
 from dt_viz.baselines.mpnet import (
     ARCHITECTURE,
-    MPNet,
-    MPNetModel,
+    Network,
     Search,
 )
-from dt_viz.baselines.mpnet_rrt import MPNetRRT
 from dt_viz.baselines.mpnet_training import SETTINGS, initial, loss_and_gradient, steps, train
 from dt_viz.baselines.postures import PlanningScene
+from dt_viz.baselines.registry import METHODS
 from dt_viz.errors import UnwantedError
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
@@ -41,7 +40,7 @@ def weights(seed=0):
 @pytest.fixture(scope="module")
 def in_the_way(problem):
     """A ball on the straight way of the joints from the first start."""
-    straight = Linear().fit(problem).plan(Union(), problem.task.starts[:1])
+    straight = linear.fit(problem)(Union(), problem.task.starts[:1])
     return Union((Sphere(as_point(straight.paths[0][100]), 0.15),))
 
 
@@ -49,7 +48,7 @@ def search(free):
     """A search on a line: postures differ in their first joint only, and `free` decides of two of its values."""
 
     line = SimpleNamespace(robot=SimpleNamespace(clip=np.asarray), is_free=lambda start, end: free(start[0], end[0]))
-    model = MPNetModel.of(weights(), 6)
+    model = Network.of(weights())
     return Search(model, cast(PlanningScene, line), np.random.default_rng(0))
 
 
@@ -59,32 +58,24 @@ def at(*values):
 
 class TestModel:
     def test_dropout_leaves_out_the_asked_share_and_is_seeded(self):
-        model = MPNetModel.of(weights(), 6)
+        model = Network.of(weights())
         (first, again), other = (
             (model.next(np.zeros(6), np.ones(6), np.random.default_rng(0)) for _ in range(2)),
             (model.next(np.zeros(6), np.ones(6), np.random.default_rng(1))),
         )
         np.testing.assert_array_equal(first, again)
         assert np.abs(first - other).max() > 1e-3
-        masks = model.planning.masks(np.random.default_rng(0), 50)
+        masks = model.masks(np.random.default_rng(0), 50)
         for mask, width in zip(masks, ARCHITECTURE.hidden[:-1], strict=True):
             assert mask.shape == (50, width)
             assert set(np.unique(mask)) == {0, 1 / (1 - ARCHITECTURE.dropout)}
             assert np.mean(mask == 0) == pytest.approx(ARCHITECTURE.dropout, abs=0.06)
 
-    @pytest.mark.parametrize("name", ["W_2", "scale", "slopes"])
-    def test_weights_that_lack_something_are_refused_by_name(self, name):
-        arrays = weights()
-        with pytest.raises(NotFittedError, match=f"{name}.*nothing"):
-            MPNetModel.of({key: value for key, value in arrays.items() if key != name}, 6)
-        with pytest.raises(NotFittedError, match=f"{name}.*found"):
-            MPNetModel.of({**arrays, name: arrays[name][:-1]}, 6)
-
-    @pytest.mark.parametrize("method", [MPNet(), MPNetRRT()], ids=lambda method: method.name)
+    @pytest.mark.parametrize("fit", [mpnet.fit, mpnet_rrt.fit])
     @pytest.mark.parametrize("arm", OTHER_ARMS)
-    def test_for_another_arm_it_says_whose_weights_they_are(self, problem, method, arm):
+    def test_for_another_arm_it_says_whose_weights_they_are(self, problem, fit, arm):
         with pytest.raises(NotFittedError, match=r"^trained for the JACO only$"):
-            method.fit(replace(problem, robot=OTHER_ARMS[arm]()))
+            fit(replace(problem, robot=OTHER_ARMS[arm]()))
 
     def test_all_weights_that_ship_take_a_megabyte(self):
         files = list((ASSETS / "baselines").glob("*.npz"))
@@ -112,7 +103,7 @@ class TestSearch:
     def test_only_colliding_stretches_are_planned_again(self):
         asked = []
 
-        def replan(a, b):
+        def replan(_, a, b):
             asked.append((a[0], b[0]))
             return at(a[0], 10, b[0])
 
@@ -124,14 +115,14 @@ class TestSearch:
 
 class TestPlanning:
     def test_where_the_straight_line_is_free_it_is_taken(self, problem):
-        straight = Linear().fit(problem).plan(Union(), problem.task.starts[:2])
-        plan = MPNet().fit(problem).plan(Union(), problem.task.starts[:2])
+        straight = linear.fit(problem)(Union(), problem.task.starts[:2])
+        plan = mpnet.fit(problem)(Union(), problem.task.starts[:2])
         for a, b in zip(joints_of(plan), joints_of(straight), strict=True):
             np.testing.assert_allclose(a, b, atol=1e-9)
         assert not plan.warnings
 
     def test_a_run_repeats_and_says_what_collides(self, problem, in_the_way):
-        first, second = (MPNet().fit(problem).plan(in_the_way, problem.task.starts[:1]) for _ in range(2))
+        first, second = (mpnet.fit(problem)(in_the_way, problem.task.starts[:1]) for _ in range(2))
         (q,) = joints_of(first)
         np.testing.assert_array_equal(q, joints_of(second)[0])
         assert load_jaco().collision.nearest_to_obstacle(q, in_the_way).distance < 0  # its encoder knows of none
@@ -143,8 +134,8 @@ class TestPlanning:
 class TestRRT:
     @needs_ompl
     def test_its_motions_are_free_and_repeat(self, problem, in_the_way):
-        planner = MPNetRRT().fit(problem)
-        first, second = (planner.plan(in_the_way, problem.task.starts[:1]) for _ in range(2))
+        planner = mpnet_rrt.fit(problem)
+        first, second = (planner(in_the_way, problem.task.starts[:1]) for _ in range(2))
         (q,) = joints_of(first)
         np.testing.assert_array_equal(q, joints_of(second)[0])
         report = load_jaco().collision.report(q, in_the_way)
@@ -156,28 +147,27 @@ class TestRRT:
 
     @needs_ompl
     def test_what_there_is_no_time_for_stays_in_collision_and_says_so(self, problem, in_the_way):
-        plan = MPNetRRT(seconds=0.0).fit(problem).plan(in_the_way, problem.task.starts[:1])
+        plan = mpnet_rrt.fit(problem, seconds=0.0)(in_the_way, problem.task.starts[:1])
         assert load_jaco().collision.nearest_to_obstacle(joints_of(plan)[0], in_the_way).distance < 0
         assert "start 1 collides" in plan.warnings[0]
 
     @needs_ompl
     def test_an_exception_within_ompl_ends_it(self, problem, in_the_way):
         alone, calls = [], []
-        MPNet().fit(problem).plan(in_the_way, problem.task.starts[:1], lambda: alone.append(0) is not None)
+        mpnet.fit(problem)(in_the_way, problem.task.starts[:1], lambda: alone.append(0) is not None)
 
         def cancelled():
             calls.append(0)
             return len(calls) == len(alone) + 20
 
-        planner = MPNetRRT().fit(problem)
+        planner = mpnet_rrt.fit(problem)
         with pytest.raises(UnwantedError):
-            planner.plan(in_the_way, problem.task.starts[:1], cancelled)
+            planner(in_the_way, problem.task.starts[:1], cancelled)
         assert len(calls) == len(alone) + 20
 
     def test_without_ompl_it_says_what_is_missing(self, monkeypatch):
         monkeypatch.setattr("dt_viz.baselines.base.find_spec", lambda module: None)
-        assert MPNetRRT().missing == ("ompl",)
-        assert MPNet().missing == ()
+        assert METHODS["mpnet-rrt"].missing == ("ompl",) and METHODS["mpnet"].missing == ()
 
 
 class TestTraining:
@@ -207,7 +197,7 @@ class TestTraining:
 
     def test_what_training_returns_can_be_planned_with(self, problem):
         lines = []
-        model = MPNetModel.of(train(problem, 100, lines.append), 6)
+        model = Network.of(train(problem, 100, lines.append))
         assert len(lines) == 1
         q, goal = problem.postures[0][[0, -1]]
         rng = np.random.default_rng(0)

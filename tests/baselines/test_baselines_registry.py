@@ -29,7 +29,7 @@ def test_the_arm_follows_each_demonstration(problem, robot):
 
 def test_our_whole_arm_clears_the_obstacle_and_says_its_joints(problem, in_the_way, robot):
     starts = np.concatenate([problem.task.starts[2:3], problem.task.starts[:2], problem.task.starts[:1] + 0.01])
-    plan = METHODS["ours"].fit(problem).plan(in_the_way, starts)
+    plan = METHODS["ours"].fit(problem)(in_the_way, starts)
     assert plan.joints is not None
     for path, q, times, start in zip(plan.paths, plan.joints, plan.times, starts, strict=True):
         assert np.array_equal(robot.end_effector(q), path)
@@ -38,14 +38,14 @@ def test_our_whole_arm_clears_the_obstacle_and_says_its_joints(problem, in_the_w
         assert np.linalg.norm(path[0] - start) < 5e-3
         assert np.linalg.norm(path[-1] - problem.learned.goal) < 1e-4
         assert in_the_way.signed_distance(path).min() > 0
-    alone = METHODS["ours-no-avoidance"].fit(problem).plan(in_the_way, starts)
+    alone = METHODS["ours-no-avoidance"].fit(problem)(in_the_way, starts)
     assert min(in_the_way.signed_distance(path).min() for path in alone.paths) < -0.02
     assert all(path[0] == pytest.approx(start) for path, start in zip(alone.paths, starts, strict=True))
 
 
 def test_where_nothing_can_move_the_arm_stays_at_its_starts(problem, robot):
     x, y, z = problem.learned.goal
-    plan = METHODS["ours"].fit(problem).plan(Union((Sphere((x, y, z), 0.15),)), problem.task.starts[:2])
+    plan = METHODS["ours"].fit(problem)(Union((Sphere((x, y, z), 0.15),)), problem.task.starts[:2])
     assert [len(path) for path in plan.paths] == [1, 1]
     assert np.linalg.norm(np.concatenate(plan.paths) - problem.task.starts[:2], axis=1).max() < 1e-4
 
@@ -59,5 +59,5 @@ def test_a_plan_that_is_cancelled_ends(problem, in_the_way, name):
         return len(calls) == 5
 
     with pytest.raises(UnwantedError):
-        planner.plan(in_the_way, problem.task.starts[:2], cancelled)
+        planner(in_the_way, problem.task.starts[:2], cancelled)
     assert len(calls) == 5

@@ -7,9 +7,8 @@ import pytest
 from oracles import central_differences
 from plans import eflow_weights as weights
 
-from dt_viz.baselines import repulsive
 from dt_viz.baselines.eflow import EFlowSystem
-from dt_viz.baselines.repulsive import RepulsionSettings
+from dt_viz.baselines.repulsive import RepulsionSettings, RepulsivePlanner
 from dt_viz.motion.stack import LIVE
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
@@ -49,13 +48,13 @@ def planner(task):
     arrays = weights(task, amplitude=0.003)
     arrays["speed_2"][:, -1] -= 1.5  # as slow as a demonstration
     system = EFlowSystem.of(task, arrays)
-    return repulsive._Planner(system, SETTINGS)
+    return RepulsivePlanner(system, SETTINGS)
 
 
 def test_motions_that_stay_out_of_range_are_those_of_eflow(task, planner):
     far = Union((Sphere((0.0, 0.0, 3.0), 0.15),))
     paths, times = planner.system.rollouts(task.starts, LIVE.spacing)
-    plan = planner.plan(far, task.starts)
+    plan = planner(far, task.starts)
     assert all(np.array_equal(a, b) for a, b in zip((*plan.paths, *plan.times), (*paths, *times), strict=True))
 
 
@@ -67,7 +66,7 @@ def beside(planner, task):
 
 
 def test_steps_follow_the_sum_of_both_velocities_and_eflow_goes_on_after_them(task, planner, beside):
-    plan = planner.plan(beside, task.starts[:1])
+    plan = planner(beside, task.starts[:1])
     path, times = plan.paths[0], plan.times[0]
     assert (np.diff(times) > 0).all()
     stepped = np.flatnonzero(np.isclose(np.diff(times), 0.05, rtol=0, atol=1e-12))
@@ -80,12 +79,12 @@ def test_steps_follow_the_sum_of_both_velocities_and_eflow_goes_on_after_them(ta
 
 def test_finer_steps_converge(task, planner, beside):
     several = (RepulsionSettings(rate) for rate in (20.0, 200.0, 400.0, 800.0))
-    *paths, finest = (replace(planner, settings=s).plan(beside, task.starts[:1]).paths[0] for s in several)
+    *paths, finest = (replace(planner, settings=s)(beside, task.starts[:1]).paths[0] for s in several)
     off = [np.linalg.norm(path[:, None] - finest, axis=2).min(axis=1).max() for path in paths]
     assert off[0] > off[1] > off[2] > 0
 
 
 def test_before_an_obstacle_on_the_goal_a_motion_stops(task, planner):
-    plan = planner.plan(Union((Sphere(as_point(planner.system.goal), 0.1),)), task.starts[:2])
+    plan = planner(Union((Sphere(as_point(planner.system.goal), 0.1),)), task.starts[:2])
     assert all(0.02 < np.linalg.norm(path[-1] - planner.system.goal) < 0.2 for path in plan.paths)
     assert max(t[-1] for t in plan.times) < SETTINGS.longest + 60

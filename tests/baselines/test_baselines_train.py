@@ -10,7 +10,7 @@ from plans import eflow_weights as weights
 
 from dt_viz.baselines import registry
 from dt_viz.baselines.base import INSTALL, NotFittedError
-from dt_viz.baselines.eflow import VERSION, EFlow
+from dt_viz.baselines.eflow import VERSION, load_system
 from dt_viz.baselines.weights import load_weights
 from dt_viz.evaluate import train
 from dt_viz.evaluate.__main__ import main
@@ -43,7 +43,7 @@ def test_weights_are_written_for_the_method_to_read_and_the_table_says_how_near_
     printed = capsys.readouterr().out
     assert "eflow, draw_s: 3 epochs, seed 4" in printed
     assert "Fréchet mean" in printed.splitlines()[-1]
-    assert EFlow(folder=tmp_path).system(TASKS["draw_s"]()).goal.shape == (3,)
+    assert load_system(TASKS["draw_s"](), tmp_path).goal.shape == (3,)
 
 
 def test_in_folds_each_demonstration_is_compared_with_what_was_learned_from_others(monkeypatch, tmp_path, capsys):
@@ -63,7 +63,7 @@ def test_in_folds_each_demonstration_is_compared_with_what_was_learned_from_othe
 def test_a_single_demonstration_cannot_be_held_out(monkeypatch, tmp_path, capsys):
     task = TASKS["draw_s"]()
     alone = replace(task, demonstrations=task.demonstrations[:1])
-    monkeypatch.setattr(train, "TASKS", {"draw_s": lambda: alone})
+    monkeypatch.setattr(train, "known_tasks", lambda _: {"draw_s": lambda: alone})
     assert main([*COMMAND, "--folds", "3", "--out", str(tmp_path)]) == 2
     assert "--folds: found one demonstration only in draw_s" in capsys.readouterr().err
 
@@ -94,7 +94,7 @@ def test_a_task_that_does_not_exist_is_refused_by_name(tmp_path, capsys):
 def test_a_method_that_is_trained_refuses_a_folder_without_its_weights(trained, tmp_path, engine):
     problem = registry.problem_of(engine.nominal(Scenario("draw_s")).learned, engine.follower)
     with pytest.raises(NotFittedError, match=r"has not been trained.*train --method \w+ --task draw_s"):
-        trained.from_folder(tmp_path).fit(problem)
+        trained.fit(problem, folder=tmp_path)
 
 
 @pytest.mark.parametrize("num", [1, 7])

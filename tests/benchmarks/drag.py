@@ -26,7 +26,6 @@ import argparse
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -39,7 +38,6 @@ from dt_viz.evaluate.options import (
     chosen_task,
     new_engine,
     positive_number,
-    ready_to_write,
     report,
     whole_number,
     write_npz,
@@ -52,6 +50,7 @@ from dt_viz.scenario.tasks import Task
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Frame, Stage
 
+OUT = "FILE.npz"
 SPACE: Mapping[str, Space] = {"hand": "task", "arm": "cspace"}
 """Spaces of the avoidance."""
 JUMP = 0.05
@@ -90,17 +89,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=whole_number(0), default=0, help="of these (default: %(default)s)")
     parser.add_argument("--step", type=positive_number("metres", 1), default=1e-3, help="metres (default: %(default)s)")
     parser.add_argument("--diameter", type=positive_number("metres", 1), metavar="D", default=0.15, help="metres")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE.npz")
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the command."""
     tasks, task = chosen_task(options)
-    out = ready_to_write(options.out, ".npz")
     drags = [_measured(new_engine(tasks), task, places, options) for places in paths(task, options)]
     moved = [drag.moved for drag in drags]
     write_npz(
-        out,
+        options.out,
         **{name: np.concatenate([getattr(d, name) for d in drags]) for name in ("rollouts", "places", "blocked")},
         seconds=np.concatenate([d.seconds for d in drags]),
         drag=np.repeat(np.arange(len(drags)), [len(d.places) for d in drags]),

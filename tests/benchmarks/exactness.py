@@ -21,7 +21,6 @@ import argparse
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -31,16 +30,15 @@ from dt_viz.avoidance.hand import Avoidance
 from dt_viz.avoidance.transform import Transform
 from dt_viz.evaluate.held_out import arrival_times
 from dt_viz.evaluate.options import (
+    TABLES,
     Row,
     add_task,
     avoiding,
     chosen_task,
     new_engine,
     number,
-    ready_to_write,
     report,
     whole_number,
-    write_json,
 )
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain
 from dt_viz.flows.fields import Array
@@ -55,6 +53,7 @@ from dt_viz.scenario.stack import plane_of
 from dt_viz.scenario.tasks import Task
 from tests.oracles import stepped as in_steps
 
+OUT = TABLES
 NUM_ROLLOUTS, NUM_POINTS = 8, 200
 FINER = 1e-4
 """Tolerance of the truth, relative to the required accuracy."""
@@ -93,20 +92,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--count", type=whole_number(1), default=10_000, help="random starts (default: %(default)s)")
     parser.add_argument("--stepped", type=whole_number(0), default=500, help="of these (default: %(default)s)")
     parser.add_argument("--seed", type=whole_number(0), default=0, help="of the starts (default: %(default)s)")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE.json")
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the command; 1 if a side cannot be made accurate enough, a motion does not arrive or departs."""
     tasks, task = chosen_task(options)
-    out, fine, figures = ready_to_write(options.out, ".json"), True, {}
+    fine = True
     learned = new_engine(tasks).nominal(Scenario(task.name, state="plain")).learned
     for part in options.parts:
         rows, part_is_fine = PARTS[part](task, learned, options)
         print(f"{task.name}, {part}")
         report(rows)
-        figures[part], fine = rows, fine and part_is_fine
-    write_json(out, {**figures, "settings": {"task": task.name, "accuracy": options.accuracy}})
+        fine = fine and part_is_fine
     return 0 if fine else 1
 
 

@@ -4,16 +4,10 @@ Session, worker and engine are the real ones; a display that records replaces th
 
     python -m tests.benchmarks latency --task draw_s --seconds 8 --out latency.json
 
-The JSON file holds, in milliseconds, the median and the 95 % of
-
-``median_ms``, ``p95_ms``, ``live_median_ms``, ``live_p95_ms``
-    the time from an edit until its rollouts are ready (stage ROLLOUTS), and until the vector field is, too (LIVE).
-``rebuild_median_ms``, ``rebuild_p95_ms``, ``whole_median_ms``, ``whole_p95_ms``
-    that for computing the rollouts alone, and all of a drag's frame with what the robot in the loop is given.
-``unit_ms``
-    time of a fixed piece of numpy work, in which figures of different machines compare.
-``frames``, ``skipped``
-    rebuilds, and edits that a newer one replaced before they were begun.
+Median and 95 % are those of the time from an edit until its rollouts are ready (stage ROLLOUTS), and until the vector
+field is, too (LIVE); and of computing these alone, with what the robot in the loop is given. A unit is the time of a
+fixed piece of numpy work, in which figures of different machines compare. Skipped are edits that a newer one replaced
+before they were begun.
 """
 
 from __future__ import annotations
@@ -23,25 +17,23 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from dt_viz.avoidance.avoidance import SPACES, Avoidance
 from dt_viz.avoidance.bias import BiasPoint
+from dt_viz.errors import FormatError
 from dt_viz.evaluate.options import (
-    InputError,
+    TABLES,
     add_task,
     avoiding,
     chosen_task,
     new_engine,
     positive_number,
-    ready_to_write,
     report,
     unit_ms,
     whole_number,
-    write_json,
 )
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.obstacles.shapes import Box, MeshObstacle, Obstacle, Point, Sphere, as_point
@@ -55,6 +47,7 @@ from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.progress import Display, Pace, Progress
 from dt_viz.session.session import Session
 
+OUT = TABLES
 EDITS_PER_SECOND = 60
 WARM_UP_SECONDS = 1.0
 
@@ -124,13 +117,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--shape", choices=tuple(SHAPES), default="sphere", help="of these (default: %(default)s)")
     parser.add_argument("--seconds", type=positive_number("seconds", 3600), required=True, help="to measure")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE.json")
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the command; 1 if the session reported an error."""
     tasks, task = chosen_task(options)
-    out = ready_to_write(options.out, ".json")
     scenario, shown = _scenario(task, options), Recorder()
     engine = _timed(new_engine(tasks), shown)
     engine.nominal(scenario)  # learned before
@@ -150,35 +141,16 @@ def run(options: argparse.Namespace) -> int:
         print(f"the session failed: {shown.error}", file=sys.stderr)
         return 1
     first, live = (np.array([f[1:] for f in shown.frames if f[0] is stage]) for stage in (Stage.ROLLOUTS, Stage.LIVE))
-    unit, num_skipped = unit_ms(), shown.num_skipped - skipped_before
-    seconds = {"": first[:, 0], "live_": live[:, 0], "rebuild_": first[:, 1], "whole_": live[:, 1]}
-    spreads = {name: 1e3 * np.percentile(values, [50, 95]) for name, values in seconds.items()}
-    figures = {
-        **{f"{name}median_ms": float(median) for name, (median, _) in spreads.items()},
-        **{f"{name}p95_ms": float(p95) for name, (_, p95) in spreads.items()},
-        "frames": len(first),
-        "skipped": num_skipped,
-        "unit_ms": unit,
-        "settings": {
-            "task": task.name,
-            "space": options.space,
-            "seconds": options.seconds,
-            "edits": num_edits,
-            "drag": options.drag,
-            "obstacles": options.obstacles,
-            "shape": options.shape,
-        },
-    }
-    write_json(out, figures)
-    names = {"rollouts": "", "also the field": "live_", "computing rollouts": "rebuild_", "computing all": "whole_"}
-    report(
-        [
-            {"edit → frame": name, **{f"{which} ms": figures[f"{key}{which}_ms"] for which in ("median", "p95")}}
-            | {"in units": figures[f"{key}median_ms"] / unit, "95 % in units": figures[f"{key}p95_ms"] / unit}
-            for name, key in names.items()
-        ]
-    )
-    print(f"{num_edits} edits, {len(first)} frames ({len(first) / elapsed:.1f} a second), {num_skipped} skipped")
+    unit, rows = unit_ms(), []
+    seconds = {"rollouts": first[:, 0], "also the field": live[:, 0]}
+    seconds |= {"computing rollouts": first[:, 1], "computing all": live[:, 1]}
+    for name, values in seconds.items():
+        median, p95 = 1e3 * np.percentile(values, [50, 95])
+        row = {"edit → frame": name, "median ms": float(median), "p95 ms": float(p95)}
+        rows.append(row | {"in units": float(median / unit), "95 % in units": float(p95 / unit)})
+    report(rows)
+    skipped = shown.num_skipped - skipped_before
+    report([{"edits": num_edits, "frames": len(first), "a second": len(first) / elapsed, "skipped": skipped}])
     return 0
 
 
@@ -197,7 +169,7 @@ def _scenario(task: Task, options: argparse.Namespace) -> Scenario:
     places = np.linspace(0, 100, options.obstacles + 2).round().astype(int)[1:-1]
     diameter = Sphere(task.obstacle_position).diameter / max(1, options.obstacles)
     if options.drag == "obstacle" and options.obstacles == 0:
-        raise InputError("--obstacles", "0", "1 or more, or --drag bias")
+        raise FormatError("--obstacles", "0", "1 or more, or --drag bias")
     shape = SHAPES[options.shape]
     obstacles = tuple(shape(as_point(place), diameter) for place in task.mean_path[places])
     scenario = avoiding(task, Avoidance(obstacles, space=options.space))
@@ -229,4 +201,4 @@ def _drag(
 def _settle(session: Session) -> None:
     """Wait until nothing is left to compute."""
     if not session.wait_idle(timeout := 120.0):
-        raise InputError("--task", f"frames that take more than {timeout:g} s", "a task that can be shown live")
+        raise FormatError("--task", f"frames that take more than {timeout:g} s", "a task that can be shown live")

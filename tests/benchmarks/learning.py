@@ -14,14 +14,16 @@ from pathlib import Path
 
 import numpy as np
 
-from dt_viz.evaluate.held_out import begun, frechet, path_from, shifted_to
-from dt_viz.evaluate.options import Row, ready_to_write, report, write_json
+from dt_viz.evaluate.held_out import NUM_COMPARED, frechet, shifted_to
+from dt_viz.evaluate.options import TABLES, Row, report
 from dt_viz.flows.fields import Array
+from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.demonstrations import Demonstration, load_demonstrations
 from dt_viz.learning.interface import AnyImitation
 from dt_viz.learning.state import learn
 from dt_viz.metrics import resample_by_arc_length
 
+OUT = TABLES
 AWAY = (0.25, 0.5)
 """Distances of starts from the mean one, relative to the extent of the demonstrations."""
 PUSH, DRAWN = 0.2, 0.05
@@ -45,12 +47,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the command's arguments."""
     parser.add_argument("files", type=Path, nargs="+", metavar="SHAPE", help="as of evaluate imitation")
     parser.add_argument("--state", choices=("plain", "augmented"), default="plain", help="default: %(default)s")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE.json")
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the command."""
-    out, found = ready_to_write(options.out, ".json"), []
+    found = []
     for path in options.files:
         demonstrations = load_demonstrations(path)
         found.append(off_course(path.stem, demonstrations, learn(demonstrations, state=options.state)))
@@ -67,7 +68,6 @@ def run(options: argparse.Namespace) -> int:
     for name, of in (("mean", np.mean), ("largest", np.max), ("smallest", np.min)):
         rows.append({"shape": name, **{column: float(of(values)) for column, values in numbers.items()}})
     report(rows)
-    write_json(out, {"state": options.state, "shapes": rows})
     return 0
 
 
@@ -84,13 +84,19 @@ def off_course(name: str, demonstrations: Sequence[Demonstration], imitation: An
         found = []
         for direction in _directions(12):
             start = mean[0] + away * extent * direction @ across
-            system, state = begun(imitation, start)
+            system, state = imitation.system, imitation.system.base.states(start)
             (error,) = frechet([path_from(system, state, len(start))], [shifted_to(start, mean)])
             found.append((error / extent, _fastest(times, system.rollout(state, times)[:, : len(start)]) / fastest))
         errors.append(float(np.mean([error for error, _ in found])))
         speeds.append(float(max(speed for _, speed in found)))
     drawn = [_drawn(imitation, d.positions[0], extent, across) for d in demonstrations[:3]]
     return OffCourse(name, tuple(errors), tuple(speeds), float(np.mean(drawn)))
+
+
+def path_from(system: DiffeomorphicSystem, state: Array, dim: int, num: int = NUM_COMPARED) -> Array:
+    """Places (num, dim), metres, of the motion from a state to the goal, evenly in base space."""
+    z = system.base.at_fraction(system.transform.forward(state), np.linspace(1, 0, num))
+    return system.transform.inverse(z)[:, :dim]
 
 
 def _directions(num: int) -> Array:
@@ -105,7 +111,7 @@ def _fastest(times: Array, path: Array) -> float:
 
 def _drawn(imitation: AnyImitation, start: Array, extent: float, across: Array) -> float:
     """Share of the rest of a motion that is still drawn after pushes from it, over places and directions."""
-    system, state = begun(imitation, start)
+    system, state = imitation.system, imitation.system.base.states(start)
     z0, dim, shares = system.transform.forward(state), len(start), []
     for left in (0.65, 0.5, 0.35):  # part of the way
         here = system.transform.inverse(system.base.at_fraction(z0, np.array([left])))[0]

@@ -13,13 +13,13 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from PIL import Image
 
 from dt_viz.control.controller import Phase
-from dt_viz.evaluate.options import InputError, add_lasa
+from dt_viz.errors import FormatError
+from dt_viz.evaluate.options import add_lasa
 from dt_viz.folders import default_cache_folder
 from dt_viz.learning.store import FitStore
 from dt_viz.robot.models import load_jaco
@@ -30,6 +30,7 @@ from dt_viz.ui.server import Server
 from dt_viz.ui.visitor import Visitor
 from tests.chromium import ARGUMENTS, CHROMIUM
 
+OUT = "DIR"
 FIRST = "first"
 """Name of the picture of the first page."""
 DRAWING = 8.0
@@ -43,7 +44,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--only", choices=names, nargs="+", metavar="NAME", help=", ".join(names))
     add_lasa(parser)
     parser.add_argument("--size", type=_size, default=(1920, 1080), metavar="W,H", help="pixels (default: 1920,1080)")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -51,15 +51,14 @@ def run(options: argparse.Namespace) -> int:
     try:
         from playwright.sync_api import sync_playwright
     except ImportError:
-        raise InputError("playwright", "not installed", "pip install 'dt-viz[test]'") from None
+        raise FormatError("playwright", "not installed", "pip install 'dt-viz[test]'") from None
     if CHROMIUM is None:
-        raise InputError("Chromium", "not installed", "apt-get install chromium")
+        raise FormatError("Chromium", "not installed", "apt-get install chromium")
     tasks = known_tasks(options.lasa)
     scenes = (FIRST, *(scene.name for scene in offered(tasks)))
     lacking = [name for name in options.only or () if name not in scenes]
     if lacking:
-        raise InputError("--only", ", ".join(lacking), "scenes whose tasks there are; --lasa DIR adds more")
-    options.out.mkdir(parents=True, exist_ok=True)
+        raise FormatError("--only", ", ".join(lacking), "scenes whose tasks there are; --lasa DIR adds more")
     width, height = options.size
     complaints: list[str] = []
     with sync_playwright() as playwright:

@@ -2,19 +2,17 @@
 
     python -m tests.benchmarks scenes --out scenes.json
 
-Each scene begins in an engine that has shown its task before, as on the page. The JSON file holds, by the scene's name,
-``rollouts_s``, ``live_s`` and ``certified_s``, seconds, and ``median`` and ``worst`` of the last.
+Each scene begins in an engine that has shown its task before, as on the page.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
-from pathlib import Path
 
 import numpy as np
 
-from dt_viz.evaluate.options import add_lasa, ready_to_write, report, write_json
+from dt_viz.evaluate.options import TABLES, add_lasa, report
 from dt_viz.folders import default_cache_folder
 from dt_viz.learning.store import FitStore
 from dt_viz.memo import Memo
@@ -25,6 +23,7 @@ from dt_viz.scenario.tasks import known_tasks
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Stage
 
+OUT = TABLES
 SHOWN = (Stage.ROLLOUTS, Stage.LIVE, Stage.CERTIFIED)
 """Stages that are timed."""
 
@@ -33,12 +32,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the command's arguments."""
     parser.add_argument("--only", choices=tuple(SCENES), nargs="+", metavar="NAME", help=", ".join(SCENES))
     add_lasa(parser)
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE.json")
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the command."""
-    tasks, out = known_tasks(options.lasa), ready_to_write(options.out, ".json")
+    tasks = known_tasks(options.lasa)
     fits, shared, figures = FitStore(default_cache_folder()), Memo(), {}
     for scene in offered(tasks):
         if options.only and scene.name not in options.only:
@@ -57,7 +55,6 @@ def run(options: argparse.Namespace) -> int:
             *({"scene": name, "certified_s": seconds} for name, seconds in over_all.items()),
         ]
     )
-    write_json(out, {**figures, **over_all})
     return 0
 
 

@@ -105,6 +105,7 @@ SUBJECTS: Mapping[str, Subject] = {
         ".npz",
         1,
     ),
+    "arms": Subject("Other arms", ("arms --count 10 --seed 11",), ".npz"),
     "table1": Subject("The paper's comparison", ("table1 --perturbed 60",), ""),
 }
 

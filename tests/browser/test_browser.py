@@ -33,7 +33,6 @@ from dt_viz.files import uploads
 from dt_viz.metrics import maximum_collision_distance
 from dt_viz.obstacles.shapes import MeshObstacle
 from dt_viz.scenario.tasks import TASKS
-from dt_viz.ui.playback import Replay
 from dt_viz.ui.scene.slice_layers import VOLUME
 from dt_viz.ui.visitor import Visitor
 
@@ -256,77 +255,6 @@ def test_the_saved_png_has_the_chosen_size_and_is_not_blank(visit):
     corner = np.asarray(image)[-120:, :450].reshape(-1, 3).astype(int)
     for shade in VOLUME[[0, -1]].astype(int):  # the legend's ends
         assert (np.abs(corner - shade).max(axis=1) < 4).any()
-
-
-def test_each_visitor_has_a_private_scene(browser, server, visit):
-    _, first = visit
-    page = browser.new_page(viewport={"width": 320, "height": 240})
-    try:
-        page.goto(f"http://127.0.0.1:{server.port}", timeout=1000 * PATIENCE)
-        wait_until(lambda: len(server.visitors) == 2, "the second visitor")
-        (second,) = set(server.visitors) - {first}
-        second.session.edit("test", **changing(second.session.scenario, avoids=False))
-        assert second.session.wait_idle(PATIENCE)
-        assert first.session.scenario.avoids
-    finally:
-        page.close()
-        wait_until(lambda: set(server.visitors) == {first}, "the second visitor to leave")
-
-
-def pixels(page):
-    """The scene without the panel, (H, W, 3)."""
-    image = Image.open(io.BytesIO(page.screenshot(clip={"x": 0, "y": 0, "width": WIDTH - 340, "height": HEIGHT})))
-    return np.asarray(image.convert("RGB")).astype(int)
-
-
-def bluish(image):
-    return (image[..., 2] - image[..., 0] > 25) & (np.ptp(image, axis=-1) < 120)
-
-
-def greenish(image):
-    return (image[..., 1] - image[..., 0] > 25) & (image[..., 1] > image[..., 2])
-
-
-def darker(image):
-    return (image.max(axis=-1) < 150) & (np.ptp(image, axis=-1) < 40)
-
-
-ARM_LAYERS = {  # the layer's label in the page, its field of View, and which pixels there are then more of
-    "Arm without avoidance": ("ghost_arm", darker),
-    "Arms along the motion": ("onion", bluish),
-    "Body points": ("body_points", greenish),
-}
-
-
-@pytest.mark.slow
-def test_the_layers_of_the_whole_arm_are_seen_once_they_are_switched_on(visit, monkeypatch):
-    page, visitor = visit
-    session, plain = visitor.session, replace(LIGHT, replay=True, arm=True)
-    session.edit("test", view=plain)
-    wait_until(lambda: visitor.shown.arm is not None and session.wait_idle(0.2), "a motion")
-    q = visitor.shown.arm.q[50]
-    monkeypatch.setattr(Replay, "posture", property(lambda _: (q, q + 0.6 * np.eye(6)[0])))
-    wait_until(lambda: np.array_equal(visitor.robot.playback.arm.q, q), "the arm to be posed")
-    open_tab(page, "Show")
-    until_drawn(visitor)
-    before = pixels(page)
-    for label, (name, coloured) in ARM_LAYERS.items():
-        box = page.get_by_label(label, exact=True).first
-        press_unseen(box)
-        wait_until(lambda name=name: getattr(session.scenario.view, name), f"the checkbox of {name}")
-        least = coloured(before).sum() + 1000
-        wait_until(lambda coloured=coloured, least=least: coloured(pixels(page)).sum() > least, f"{name} to be seen")
-        session.edit("test", view=plain)
-
-    press_unseen(page.get_by_label("Joint plots").first)
-    drawn = """() => [...document.querySelectorAll('.uplot canvas')].filter(canvas => canvas.width).map(canvas => {
-        const data = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;
-        let coloured = 0;
-        for (let i = 0; i < data.length; i += 4)
-            coloured += data[i + 3] > 128 && Math.max(...data.slice(i, i + 3)) - Math.min(...data.slice(i, i + 3)) > 60;
-        return coloured;
-    })"""
-    wait_until(lambda: [count > 300 for count in page.evaluate(drawn)] == [True, True], "both plots to be drawn")
 
 
 def test_keys_do_what_the_panel_does(visit):

@@ -6,21 +6,20 @@ import numpy as np
 import pytest
 from hook import NUM_DEMONSTRATIONS, apart, hook
 
-from dt_viz.avoidance.hand import Avoidance
+from dt_viz.avoidance.avoidance import Avoidance, Space
 from dt_viz.evaluate.__main__ import main
-from dt_viz.evaluate.around import TURN_ARC, Place, Rollout, _shares
+from dt_viz.evaluate.around import FIGURES, TURN_ARC, Place, _shares
 from dt_viz.metrics import distance_from_path, sharpest_turn
 from dt_viz.obstacles.shapes import Sphere
-from dt_viz.obstacles.union import Union
 from dt_viz.robot.models import load_jaco
-from dt_viz.scenario.tasks import lasa_tasks
+from dt_viz.scenario.tasks import known_tasks
 from dt_viz.warning import ARM, Kind, MotionWarning
 
 
 @pytest.fixture(scope="module")
 def middle(lasa):
     """The middle of the mean demonstration in the world, metres."""
-    return lasa_tasks(lasa)["Hook"]().mean_path[50]
+    return known_tasks(lasa)["Hook"]().mean_path[50]
 
 
 @pytest.fixture
@@ -120,7 +119,7 @@ def test_places_of_the_hand_are_measured_at_its_point_and_compared_with_what_is_
 def test_places_are_any_shapes_of_any_size_along_the_whole_motion(lasa, measured):
     shapes = "--shape any --number 2 --size 0.06,0.25 --no-avoidance"
     arrays = measured("around", f"--count 12 --along 0,1 --spread 0 {shapes}")[0]
-    mean = lasa_tasks(lasa)["Hook"]().mean_path
+    mean = known_tasks(lasa)["Hook"]().mean_path
     places, sizes = arrays["places"][1:], arrays["sizes"][1:]
     assert (places[:, 0] != places[:, 1]).any(axis=1).all()
     assert places.shape == sizes.shape == (12, 2, 3) and arrays["turns"].shape == (13, 2, 4)
@@ -131,46 +130,37 @@ def test_places_are_any_shapes_of_any_size_along_the_whole_motion(lasa, measured
     assert distance_from_path(places.reshape(-1, 3), mean).max() < 1e-9
 
 
-def rollout(**changes):
-    """Measurements of a rollout that gives way to a sphere."""
-    values: dict[str, Any] = {
-        "hand": 0.03,
-        "arm": 0.012,
-        "hand_without": -0.04,
-        "arm_without": -0.06,
-        "frechet": 0.08,
-        "detour": 0.07,
-    }
-    rest = {"turn": 20.0, "turn_without": 10.0, "num_outside": 0, "goal_miss": 1e-6}
-    return Rollout(**(values | rest | changes))
+USUAL = {"hand": 0.03, "arm": 0.012, "hand_without": -0.04, "arm_without": -0.06, "frechet": 0.08, "detour": 0.07}
+SPHERE = Sphere((0.0, 0.0, 0.0), 0.1)
+
+
+def place(*rollouts, space: Space = "cspace", ends=(0.1, 0.1, 0.2), blocked=()):
+    """A place: what is unusual about each rollout, None of a start without one."""
+    figures = np.full((len(ends) - 1, len(FIGURES)), np.nan)
+    motions: Any = {i: None for i, changes in enumerate(rollouts) if changes is not None}
+    for i in motions:
+        for figure, value in ({"turn": 20, "turn_without": 10} | USUAL | rollouts[i]).items():
+            figures[i, FIGURES.index(figure)] = value
+    return Place(Avoidance((SPHERE,), space=space), np.array(ends), motions, figures, blocked)
 
 
 @pytest.mark.parametrize(("space", "clearance", "forced"), [("task", 0.01, 0.06), ("cspace", -0.002, 0.08)])
 def test_a_place_is_judged_by_its_worst_rollout_and_by_what_avoids(space, clearance, forced):
-    worst = rollout(hand=0.01, arm=-0.002, hand_without=-0.05, arm_without=-0.07, detour=0.12)
-    obstacle = Union((Sphere((0.0, 0.0, 0.0), 0.1),))
-    place = Place(
-        obstacle, Avoidance(obstacle.parts, space=space), np.array([0.1, -0.1, 0.2]), {0: rollout(), 2: worst}, {}
-    )
-    assert place.clearance == clearance and place.ratio == pytest.approx(0.12 / forced)
+    worst = {"hand": 0.01, "arm": -0.002, "hand_without": -0.05, "arm_without": -0.07, "detour": 0.12}
+    found = place({}, None, worst, space=space, ends=(0.1, -0.1, 0.2, 0.2))
+    assert found.clearance == clearance and found.ratio == pytest.approx(0.12 / forced)
 
 
 def test_only_starts_with_a_rollout_and_the_goal_have_to_be_free():
-    obstacle, ends = Union((Sphere((0.0, 0.0, 0.0), 0.1),)), np.array([0.1, -0.1, 0.2])
-    first, both = ({i: rollout() for i in starts} for starts in ((0,), (0, 1)))
-    assert Place(obstacle, Avoidance(obstacle.parts), ends, first, {}).is_free
-    assert not Place(obstacle, Avoidance(obstacle.parts), ends, both, {}).is_free
-    covered = np.array([0.1, -0.1, -0.2])  # the goal, too
-    assert not Place(obstacle, Avoidance(obstacle.parts), covered, first, {}).is_free
+    assert place({}, None, ends=(0.1, -0.1, 0.2)).is_free
+    assert not place({}, {}, ends=(0.1, -0.1, 0.2)).is_free
+    assert not place({}, None, ends=(0.1, -0.1, -0.2)).is_free
 
 
 def test_shares_are_of_the_places_that_have_motions():
-    obstacle, ends = Union((Sphere((0.0, 0.0, 0.0), 0.1),)), np.array([0.1, 0.1, 0.2])
-    avoidance = Avoidance(obstacle.parts, space="cspace")
-    clearances = {"kept": 0.012, "nearly": 0.0095, "near": 0.005, "touched": -0.002}
-    places = [Place(obstacle, avoidance, ends, {0: rollout(arm=arm), 1: rollout()}, {}) for arm in clearances.values()]
-    places.append(Place(obstacle, avoidance, ends, {1: rollout(turn=91.0)}, {}))
-    places.append(Place(obstacle, avoidance, -ends, {}, {}, (MotionWarning(Kind.NO_WAY, "", ARM),)))
+    places = [place({"arm": clearance}, {}) for clearance in (0.012, 0.0095, 0.005, -0.002)]
+    places.append(place(None, {"turn": 91}))
+    places.append(place(ends=(-0.1, -0.1, -0.2), blocked=(MotionWarning(Kind.NO_WAY, "", ARM),)))
     figures = {row["figure"]: str(row["value"]) for row in _shares(places)}
     assert figures["places that leave the end effector's starts and goal free"].startswith("5 of 6")
     assert figures["blocked"].startswith("1 of 6") and figures["blocked between free ends"].startswith("1 of 6")

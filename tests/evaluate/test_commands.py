@@ -7,7 +7,6 @@ from hook import write_mat
 
 from dt_viz.evaluate import options
 from dt_viz.evaluate.__main__ import main
-from tests.benchmarks.__main__ import NAMES
 from tests.benchmarks.__main__ import main as benchmarks
 
 
@@ -24,7 +23,7 @@ def status_of(main, arguments):
     [
         ("imitation missing.mat --out out", "missing.mat: path: found no such file or folder; accepted: "),
         ("imitation Hook.mat Hook.csv --out out", "SHAPE: found 'Hook.mat' and 'Hook.csv'"),
-        ("imitation Hook.mat --out file/below", "--out: found 'file/below', which cannot be made"),
+        ("imitation Hook.mat --out file/below", "--out: found 'file/below', which cannot be written"),
         ("imitation Hook.mat --folds 1 --out out", "argument --folds: found '1'; accepted: a whole number"),
         ("imitation alone.csv --folds 2 --out out", "--leave-one-out: found one demonstration only in alone.csv"),
         (
@@ -82,8 +81,7 @@ def test_what_a_benchmark_cannot_use_is_named(tmp_path, monkeypatch, capsys, arg
 def test_a_command_that_moved_says_where_to(capsys, name):
     assert main([name, "--task", "draw_s"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(f"python -m dt_viz.evaluate: {name} is now, in a checkout: python -m tests.benchmarks ")
-    assert line.split()[-1] in NAMES
+    assert line.startswith(f"python -m dt_viz.evaluate: {name} is now, in a checkout: python -m tests.benchmarks")
 
 
 @pytest.mark.parametrize("name", ["avoidance", "places", "hand"])

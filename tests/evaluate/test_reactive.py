@@ -1,6 +1,5 @@
 """Obstacles that cross the motion of the robot in the loop: where they go, and what is measured."""
 
-from dataclasses import replace
 from itertools import islice
 
 import numpy as np
@@ -8,7 +7,7 @@ import pytest
 
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.evaluate import reactive
-from dt_viz.obstacles.shapes import Sphere, as_point
+from dt_viz.obstacles.shapes import UPRIGHT, Sphere, as_point
 from dt_viz.robot.models import load_jaco
 
 
@@ -50,38 +49,36 @@ def test_spheres_cross_the_motion_when_the_hand_is_there(bench, speed, num):
     assert [crossing.start for crossing, _ in found] == [0, 1, 2]
     for crossing, seconds in found:
         hand, joints = bench.undisturbed(crossing.start)
-        assert seconds == pytest.approx(len(hand) * reactive.TICK) and len(crossing.passages) == num
+        assert seconds == pytest.approx(len(hand) * reactive.TICK) and crossing.places.shape[1] == num
         assert np.linalg.norm(hand[-1] - bench.goal) < 1e-3
-        assert 0 in [crossing.begins, *(passage.comes for passage in crossing.passages)]  # no time is lost
-        for passage in crossing.passages:
-            step = np.linalg.norm(np.diff(passage.path, axis=0), axis=1)
-            assert step.sum() == pytest.approx(passage.length) and np.ptp(step) < 0.01 * step.max()
-            assert passage.gone - passage.comes == pytest.approx(passage.length / speed)
-            assert 0.8 < passage.length < 1.2
-            middle = (passage.comes + passage.gone) / 2
-            tick = round((middle - crossing.begins) / reactive.TICK)
+        comes = np.isfinite(crossing.places[..., 0]).argmax(axis=0)
+        assert crossing.begins == 0 or comes.min() == 0  # no time is lost
+        for first, places in zip(comes, crossing.places.transpose(1, 0, 2), strict=True):
+            path = places[np.isfinite(places[:, 0])]
+            step = np.linalg.norm(np.diff(path, axis=0), axis=1)
+            np.testing.assert_allclose(step, speed * reactive.TICK, rtol=0.01)
+            assert 0.75 < step.sum() < 1.2
+            tick = round(first + len(path) / 2 - crossing.begins / reactive.TICK)
             assert 0.2 * len(hand) < tick < 0.8 * len(hand)
-            assert np.linalg.norm(passage.at(middle) - hand[tick]) < 0.08
-            np.testing.assert_allclose(passage.at(passage.comes), passage.path[0])
-            np.testing.assert_allclose(passage.at(passage.gone - 1e-9), passage.path[-1], atol=1e-6)
-            assert np.isnan(passage.at(passage.gone)).all() and np.isnan(passage.at(passage.comes - 1e-9)).all()
-            there = joints[max(0, int((passage.comes - crossing.begins) / reactive.TICK))]
-            gap = bench.follower.whole_arm.clearance(there[None], bench.shape(passage.path[0]))[0]
-            assert gap >= reactive.SETTINGS.start_room - 0.01
-            assert passage.path[:, 2].min() >= 0.075 + reactive.SETTINGS.table_room
+            assert np.linalg.norm(path[len(path) // 2] - hand[tick]) < 0.08
+            there = joints[max(0, int(first - crossing.begins / reactive.TICK))]
+            gap = bench.follower.whole_arm.clearance(there[None], bench.shape(path[0]))[0]
+            assert gap >= reactive.SETTINGS.start_room - 0.02
+            assert path[:, 2].min() >= 0.075 + reactive.SETTINGS.table_room
+        assert np.isnan(crossing.at(len(crossing.places))).all()
 
 
 def test_a_second_obstacle_and_a_turned_box_count(engine):
     boxes = reactive.Bench(engine, "draw_s", 0.15, 0.03, boxes=True)
     crossing, _ = next(reactive.crossings(boxes, 0.5, seed=2, num=2))
-    t = max(passage.comes for passage in crossing.passages)
+    t = int(np.isfinite(crossing.places[..., 0]).argmax(axis=0).max())
     parts = boxes.obstacles(crossing, t)
-    assert len(parts) == 2 and parts[0].wxyz == crossing.passages[0].wxyz != parts[1].wxyz
+    assert len(parts) == 2 and parts[0].wxyz == crossing.wxyz[0] != parts[1].wxyz
     np.testing.assert_allclose([part.position for part in parts], crossing.at(t))
     q, model = boxes.starts[:1], load_jaco().collision
-    run = reactive.Run(q=[q[0]], obstacle=[crossing.at(t)])
+    alone = reactive.Crossing(0, 0.0, crossing.at(t)[None], crossing.wxyz)
     expected = min(float(model.obstacle_distance(q, part)[0][0]) for part in parts)
-    assert reactive.smallest_distance(boxes, run, crossing) == pytest.approx(expected, abs=1e-9)
+    assert reactive.smallest_distance(boxes, reactive.Run([q[0]]), alone) == pytest.approx(expected, abs=1e-9)
 
 
 def test_the_smallest_distance_is_found_between_ticks_too(bench):
@@ -92,8 +89,8 @@ def test_the_smallest_distance_is_found_between_ticks_too(bench):
     fine = np.linspace(0, 1, 7)[:, None]
     dense = np.concatenate([(1 - fine) * a + fine * b for a, b in ((places[0], places[1]), (places[1], places[2]))])
     least = nearest(np.repeat(q[:1], len(dense), axis=0), dense, bench.diameter)
-    crossing = reactive.Crossing(0, 0.0, (reactive.Passage(places, 0.0, 1.0, 1.0),))
-    found = reactive.smallest_distance(bench, reactive.Run(q=list(q), obstacle=list(places[:, None])), crossing)
+    crossing = reactive.Crossing(0, 0.0, places[:, None], [UPRIGHT])
+    found = reactive.smallest_distance(bench, reactive.Run(list(q)), crossing)
     assert found == pytest.approx(least, abs=1e-9)
     assert found < nearest(q[:3], places[:3], bench.diameter) - 0.01
 
@@ -102,11 +99,10 @@ def test_the_room_of_an_obstacle_that_comes_is_that_of_the_arm_as_it_is_then(ben
     q = np.stack([bench.starts[0], bench.starts[0] + 0.5])
     hands = bench.robot.end_effector(q)
     gone, far = np.full(3, np.nan), np.array([3.0, 0.0, 0.0])
-    passage = reactive.Passage(np.zeros((2, 3)), 0.0, 1.0, 1.0)
-    crossing = reactive.Crossing(0, 0.0, (passage, passage))
 
     def room(*centres):
-        return reactive.room_at_coming(bench, reactive.Run(q=list(q), obstacle=list(np.array(centres))), crossing)
+        crossing = reactive.Crossing(0, 0.0, np.array(centres), 2 * [UPRIGHT])
+        return reactive.room_at_coming(bench, reactive.Run(list(q)), crossing)
 
     assert room([far, gone], [hands[0], far]) > 1  # one has come before, the other is not there yet
     assert room([far, gone], [far, hands[1]]) < 0
@@ -116,16 +112,14 @@ def test_the_room_of_an_obstacle_that_comes_is_that_of_the_arm_as_it_is_then(ben
 
 def test_figures_of_a_run_are_relative_to_the_limits(bench):
     q = bench.starts[0] + np.cumsum([[0.0], [0.01], [0.03], [0.03]], axis=0) * np.eye(6)[0]
-    away = [np.array([[3.0, 0.0, 0.0]])] * 4
-    run = reactive.Run(list(q), [0.0, 0.01, 0.02, 0.03], away, [0.001, 0.003])
-    found = reactive.RunFigures.of(
-        bench, reactive.Crossing(0, 0.01, (reactive.Passage(np.zeros((2, 3)), 0.0, 1.0, 1.0),)), run, 0.005
-    )
-    assert found.velocity == pytest.approx(3.0 / bench.robot.velocity_limits[0])
-    assert found.acceleration == pytest.approx(200 / ControllerSettings().acceleration)
-    assert found.lost == pytest.approx(0.015) and found.distance > 2
-    assert found.missed == pytest.approx(np.linalg.norm(bench.robot.end_effector(q[-1]) - bench.goal))
-    touched = replace(found, distance=-0.002, missed=1e-4, lost=0.215)
+    crossing = reactive.Crossing(0, 0.01, np.array(4 * [[[3.0, 0.0, 0.0]]]), [UPRIGHT])
+    run = reactive.Run(list(q), [0.001, 0.003])
+    found = reactive.figures_of(bench, crossing, run, 0.005)
+    assert found["velocity"] == pytest.approx(3.0 / bench.robot.velocity_limits[0])
+    assert found["acceleration"] == pytest.approx(200 / ControllerSettings().acceleration)
+    assert found["lost"] == pytest.approx(0.015) and found["clearance"] > 2e3
+    assert found["missed"] == pytest.approx(1e3 * np.linalg.norm(bench.robot.end_effector(q[-1]) - bench.goal))
+    touched = found | {"clearance": -2.0, "missed": 0.1, "lost": 0.215}
     row = reactive.summary([found, touched, touched])
     assert [row[name] for name in ("without contact", "clearance mm", "goal reached")] == ["1 of 3", "-2.0", "2 of 3"]
     assert [row[name] for name in ("time lost s", "tick ms")] == ["0.2 (0.2)", "2.00 (3.0, 3)"]

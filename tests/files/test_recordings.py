@@ -1,44 +1,27 @@
 """Visitors' recordings: several files at once, archives, what is asked, and what is refused, by the limited process."""
 
 import io
-import json
 import zipfile
-from pathlib import Path
-from typing import Any
+from functools import partial
 
 import numpy as np
 import pytest
+from recorded import TIMES, bag, path_of, table
 
 from dt_viz.errors import FormatError
 from dt_viz.files import recordings
-from dt_viz.files.recordings import NO_COLUMN, answer_recordings, recordings_of, request
+from dt_viz.files.recordings import NO_COLUMN, Recordings, read_recordings
 from dt_viz.files.uploads import read_upload
 
-TIMES = 0.02 * np.arange(60)
 HEADER = ("t", "x", "y", "z")
-
-
-def path_of(seed=0, num=60):
-    """A motion (num, 3) within an arm's reach."""
-    return np.array([0.3, -0.4, 0.2]) + np.random.default_rng(seed).normal(scale=0.02, size=(num, 3)).cumsum(axis=0)
-
-
-def table(names, columns):
-    rows = [",".join(f"{value!r}" for value in map(float, row)) for row in np.column_stack(columns)]
-    return "\n".join([",".join(names), *rows]).encode()
-
-
 JOINT_NAMES = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "wrist_yaw")
 TIMED = table(HEADER, [TIMES, *path_of().T])
 
 
 def read(*files, answers=None, process=False):
     """What is read of files, each a name and its content."""
-    content, options = request(files, answers or {}, JOINT_NAMES)
-    if process:
-        return recordings_of(read_upload("takes", "recording", content, options=options)[0])
-    arrays, _ = answer_recordings(content, "recording", **json.loads(json.dumps(options)))
-    return recordings_of(arrays)
+    reader = partial(read_upload, Recordings) if process else read_recordings
+    return reader([*files], answers=answers or {}, joint_names=[*JOINT_NAMES])
 
 
 def zipped(files, compression=zipfile.ZIP_STORED):
@@ -68,26 +51,16 @@ def test_several_files_and_an_archive_of_their_folder_give_the_same_takes(proces
 
 
 @pytest.mark.parametrize("process", [False, True])
-def test_columns_named_as_the_joints_of_the_arm_are_its_angles(process):
-    angles = np.random.default_rng(4).normal(size=(6, 60))
-    given = [*zip(JOINT_NAMES, angles, strict=True)][::-1]
-    files = {
-        "a.csv": table(["t", *(name for name, _ in given)], [TIMES, *(values for _, values in given)]),
-        "b.csv": table(["t", *(f"{name}.pos" for name in JOINT_NAMES), "gripper.pos"], [TIMES, *angles, TIMES]),
-    }
-    found = read(*files.items(), process=process)
-    assert [take.joint_names for take in found.takes] == [JOINT_NAMES, JOINT_NAMES] and not found.questions
-    for take in found.takes:
-        np.testing.assert_array_equal(take.joints, angles.T)
-
-
-def test_joint_angles_orientations_and_missing_times_come_through():
+def test_joint_angles_orientations_and_missing_times_come_through(process):
     turns = np.tile([0.0, 0.0, 0.0, 1.0], (60, 1))
     poses = table(("x", "y", "z", "qx", "qy", "qz", "qw"), [*path_of().T, *turns.T])
-    found = read(("a.csv", poses), ("b.npy", npy(np.zeros((50, 6)))))
+    angles = table(["t", *(f"{name}.pos" for name in JOINT_NAMES), "gripper.pos"], np.eye(8))
+    found = read(("a.csv", poses), ("b.npy", npy(np.zeros((50, 6)))), ("c.csv", angles), process=process)
     assert not found.takes[0].is_timed and found.takes[0].orientations is not None
     np.testing.assert_array_equal(found.takes[0].orientations, np.roll(turns, 1, axis=1))
     assert found.takes[1].positions is None and found.takes[1].joint_names[:2] == ("joint1", "joint2")
+    assert found.takes[2].joint_names == JOINT_NAMES and not found.questions
+    np.testing.assert_array_equal(found.takes[2].joints, np.eye(8)[:, 1:7])
 
 
 def test_a_file_that_cannot_be_read_is_named_and_the_others_are_read():
@@ -155,17 +128,12 @@ def test_three_columns_without_names_whose_first_may_have_times_are_asked_about(
 
 
 def test_the_topic_of_a_bag_is_asked_for(tmp_path):
-    pytest.importorskip("rosbags")
-    from rosbags.rosbag2 import StoragePlugin, Writer
-    from rosbags.typesys import Stores, get_typestore
-
-    kind, store = "geometry_msgs/msg/Point", get_typestore(Stores.ROS2_HUMBLE)
-    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        for sign, topic in ((1.0, "/hand"), (-1.0, "/other")):
-            connection = writer.add_connection(topic, kind, typestore=store)
-            for k, place in enumerate(path_of()):
-                message = store.types[kind](*(sign * place))
-                writer.write(connection, (k + 1) * 10**7, store.serialize_cdr(message, kind))
+    kind = "geometry_msgs/msg/Point"
+    both = {
+        topic: (kind, lambda k, types, sign=sign: types[kind](*(sign * path_of()[k])))
+        for sign, topic in ((1.0, "/hand"), (-1.0, "/other"))
+    }
+    bag(tmp_path / "bag.mcap", both)
     files = {f"bag/{path.name}": path.read_bytes() for path in (tmp_path / "bag").iterdir()}
     (name,) = [name for name in files if name.endswith(".mcap")]
     for sent in (("take.mcap", files[name]), ("folder.zip", zipped(files))):
@@ -175,22 +143,18 @@ def test_the_topic_of_a_bag_is_asked_for(tmp_path):
         np.testing.assert_array_equal(read(sent, answers={"topic": "/other"}).takes[0].positions, -path_of())
 
 
-@pytest.mark.parametrize("key", ["b", "data"])
-def test_complex_numbers_are_refused_not_left_out(key):
+@pytest.mark.parametrize(("suffix", "key"), [(".npz", "b"), (".npz", "data"), (".h5", "demo_1/pos")])
+def test_complex_numbers_are_refused_not_left_out(tmp_path, suffix, key):
     """A take of them went without a word where others were in the file."""
-    file = io.BytesIO()
-    save: Any = np.savez
-    save(file, a=path_of(), **{key: path_of() + 1j})
-    (refused,) = read(("a.csv", TIMED), ("c.npz", file.getvalue())).refused
-    assert refused.startswith("c.npz: ") and f"'{key}" in refused and "complex" in refused
-
-
-def test_complex_numbers_in_hdf5_are_refused_too(tmp_path):
-    h5py = pytest.importorskip("h5py")
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        file["demo_0/pos"], file["demo_1/pos"] = path_of(), path_of() + 1j
-    content = Path(tmp_path, "a.h5").read_bytes()
-    assert "complex numbers" in read(("a.csv", TIMED), ("a.h5", content)).refused[0]
+    path, arrays = tmp_path / f"c{suffix}", {"demo_0/pos": path_of(), key: path_of() + 1j}
+    if suffix == ".npz":
+        np.savez(path, **arrays)  # pyright: ignore[reportArgumentType]
+    else:
+        with pytest.importorskip("h5py").File(path, "w") as file:
+            for name, array in arrays.items():
+                file[name] = array
+    (refused,) = read(("a.csv", TIMED), (path.name, path.read_bytes())).refused
+    assert refused.startswith(f"c{suffix}: ") and f"'{key.rpartition('/')[2]}" in refused and "complex" in refused
 
 
 def test_archives_that_unpack_to_much_or_climb_out_do_no_harm(tmp_path):
@@ -210,11 +174,6 @@ def test_more_numbers_than_a_visitor_may_keep_are_refused(monkeypatch):
     monkeypatch.setattr(recordings, "LIMITS", recordings.RecordingLimits(numbers=300))
     found = read(("a.csv", TIMED), ("b.csv", TIMED))
     assert len(found.takes) == 1 and "on the page; the command line takes more" in found.refused[0]
-
-
-def test_where_nothing_can_be_read_the_first_reason_is_given():
-    with pytest.raises(FormatError, match=r"a\.csv: file: found an empty file"):
-        read(("a.csv", b""), ("b.csv", b""))
 
 
 def test_where_nothing_can_be_read_the_reason_is_said_once():

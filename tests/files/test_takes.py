@@ -2,14 +2,29 @@
 
 import json
 import sys
-from contextlib import suppress
 
 import numpy as np
 import pytest
 import scipy.io
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
+from recorded import (
+    ANGLES,
+    POSE,
+    STATES,
+    TEXTS,
+    TF,
+    TIMES,
+    Planar,
+    bag,
+    lerobot,
+    path_of,
+    pose,
+    robomimic,
+    table,
+    turns_of,
+    wxyz,
+)
 
 from dt_viz.files.columns import role_of
 from dt_viz.files.takes import READERS
@@ -21,27 +36,7 @@ from dt_viz.learning.demonstrations import (
     save_demonstrations,
 )
 
-TIMES = 0.02 * np.arange(60)
 RNG = np.random.default_rng(1)
-
-
-def path_of(seed=0, num=60):
-    """A motion (num, 3) within an arm's reach."""
-    return np.array([0.3, -0.4, 0.2]) + np.random.default_rng(seed).normal(scale=0.02, size=(num, 3)).cumsum(axis=0)
-
-
-def turns_of(num=60):
-    """Orientations (num, 4), xyzw, that turn steadily."""
-    return Rotation.from_rotvec(np.linspace(0, 1, num)[:, None] * [0.3, 1.0, -0.2]).as_quat()
-
-
-def wxyz(turns):
-    return np.roll(turns, 1, axis=1)
-
-
-def table(names, columns, delimiter=","):
-    rows = [delimiter.join(f"{value!r}" for value in map(float, row)) for row in np.column_stack(columns)]
-    return "\n".join([delimiter.join(names), *rows]).encode()
 
 
 def refusal(content, name, **options):
@@ -324,19 +319,7 @@ class TestOrientations:
         assert read.orientations is not None and not read.orientations.flags.writeable
 
 
-class Planar:
-    """Kinematics of two links of 0.4 m in a plane."""
-
-    joint_names = ("shoulder", "elbow")
-
-    def end_effector(self, q):
-        angles = np.cumsum(q, axis=-1)
-        return np.stack([0.4 * np.cos(angles).sum(-1), 0.4 * np.sin(angles).sum(-1), 0 * angles[..., 0]], axis=-1)
-
-
 class TestJoints:
-    Q = np.column_stack([np.linspace(0, 1, 60), np.linspace(1, -0.5, 60)])
-
     @pytest.mark.parametrize(
         ("names", "order", "size"),
         [
@@ -349,9 +332,9 @@ class TestJoints:
         ],
     )
     def test_angles_become_places_of_the_hand_by_the_arm(self, names, order, size):
-        content = table(["t", *names], [TIMES, *(size * self.Q[:, order]).T])
+        content = table(["t", *names], [TIMES, *(size * ANGLES[:, order]).T])
         (read,) = read_demonstrations(content, "a.csv", arm=Planar())
-        assert_same(read, Planar().end_effector(self.Q))
+        assert_same(read, Planar().end_effector(ANGLES))
         message = refusal(content, "a.csv")
         assert "angles of 2 joints" in message and "arm=…" in message
 
@@ -369,7 +352,7 @@ class TestJoints:
     def test_columns_named_as_the_arms_joints_are_its_angles(self, tmp_path, suffix, names, size):
         columns = dict(
             zip(
-                [*names, "elbow_vel", "action.elbow", "gripper_elbow"], size * self.Q[:, [1, 0, 0, 0, 0]].T, strict=True
+                [*names, "elbow_vel", "action.elbow", "gripper_elbow"], size * ANGLES[:, [1, 0, 0, 0, 0]].T, strict=True
             )
         )
         path = tmp_path / f"a{suffix}"
@@ -380,20 +363,20 @@ class TestJoints:
         else:
             pq, pa = pytest.importorskip("pyarrow.parquet"), pytest.importorskip("pyarrow")
             pq.write_table(pa.table({"t": TIMES, **columns}), path)
-        assert_same(load_demonstrations(path, arm=Planar())[0], Planar().end_effector(self.Q))
+        assert_same(load_demonstrations(path, arm=Planar())[0], Planar().end_effector(ANGLES))
         with pytest.raises(DemonstrationError, match=r"no places|no takes"):
             load_demonstrations(path)
 
     def test_some_of_the_arms_joints_are_refused_with_their_names(self):
-        content = table(["t", "shoulder", "wrist"], [TIMES, *self.Q.T])
+        content = table(["t", "shoulder", "wrist"], [TIMES, *ANGLES.T])
         with pytest.raises(
             DemonstrationError, match=r"angles of 1 joints \(shoulder\).*the arm's 2 \(shoulder, elbow\)"
         ):
             read_demonstrations(content, "a.csv", arm=Planar())
 
     def test_degrees_are_recognised_and_a_gripper_is_left_out(self, tmp_path):
-        np.savez(tmp_path / "a.npz", t=TIMES, qpos=np.column_stack([180 / np.pi * self.Q, np.full(60, 30)]))
-        assert_same(load_demonstrations(tmp_path / "a.npz", arm=Planar())[0], Planar().end_effector(self.Q))
+        np.savez(tmp_path / "a.npz", t=TIMES, qpos=np.column_stack([180 / np.pi * ANGLES, np.full(60, 30)]))
+        assert_same(load_demonstrations(tmp_path / "a.npz", arm=Planar())[0], Planar().end_effector(ANGLES))
 
     def test_arrays_as_wide_as_the_arm_are_its_angles(self, tmp_path):
         class Long(Planar):
@@ -412,26 +395,6 @@ class TestJoints:
             load_demonstrations(tmp_path)
         with pytest.raises(DemonstrationError, match=r"b\.csv.*angles of 5 joints.*the arm's 2 \(shoulder, elbow\)"):
             load_demonstrations(tmp_path / "b.csv", arm=Planar())
-
-
-def lerobot(folder, names):
-    """A LeRobot data set of two episodes."""
-    pa, pq = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
-    (folder / "meta").mkdir(parents=True)
-    (folder / "data" / "chunk-000").mkdir(parents=True)
-    state = {"dtype": "float32", "shape": [3], "names": names}
-    (folder / "meta" / "info.json").write_text(json.dumps({"fps": 50, "features": {"observation.state": state}}))
-    for k in range(2):
-        values = path_of(k).astype(np.float32)
-        columns = {
-            "observation.state": pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), 3),
-            "action": pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), 3),
-            "timestamp": TIMES.astype(np.float32),
-            "frame_index": np.arange(60),
-            "episode_index": np.full(60, k),
-            "task": ["pour"] * 60,
-        }
-        pq.write_table(pa.table(columns), folder / "data" / "chunk-000" / f"episode_{k:06}.parquet")
 
 
 class TestParquet:
@@ -460,20 +423,6 @@ class TestParquet:
         np.testing.assert_allclose(load_demonstrations(file, arm=Planar())[0].duration, TIMES[-1], rtol=1e-6)
 
 
-def robomimic(path):
-    h5py = pytest.importorskip("h5py")
-    with h5py.File(path, "w") as file:
-        data = file.create_group("data")
-        data.attrs["env_args"] = json.dumps({"env_kwargs": {"control_freq": 50}})
-        for k in (0, 1, 10):
-            obs = data.create_group(f"demo_{k}/obs")
-            obs["robot0_eef_pos"], obs["robot0_eef_quat"] = path_of(k), turns_of()
-            obs["robot0_joint_pos"], obs["robot0_gripper_qpos"] = RNG.normal(size=(60, 7)), np.zeros((60, 2))
-            obs["object"], obs["agentview_image"] = np.zeros((60, 10)), np.zeros((60, 8, 8, 3), np.uint8)
-            data[f"demo_{k}/actions"], data[f"demo_{k}/dones"] = np.zeros((60, 7)), np.zeros(60, int)
-        file["mask/train"] = np.array([b"demo_0", b"demo_1"])
-
-
 class TestHdf5:
     def test_robomimic(self, tmp_path):
         robomimic(tmp_path / "low_dim.hdf5")
@@ -487,72 +436,6 @@ class TestHdf5:
         with h5py.File(tmp_path / "a.h5", "w") as file:
             file["time"], file["positions"] = TIMES, path_of()
         assert_same(load_demonstrations(tmp_path / "a.h5")[0], path_of())
-
-
-NANOSECONDS = 1_700_000_000 * 10**9 + (TIMES * 1e9).round().astype(np.int64)
-
-
-def bag(path, topics):
-    """Write a bag: for each topic, its type and what makes a message of a sample's number and of the types."""
-    pytest.importorskip("rosbags")
-    from rosbags.rosbag1 import Writer as Writer1
-    from rosbags.rosbag2 import StoragePlugin
-    from rosbags.rosbag2 import Writer as Writer2
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    first = path.suffix == ".bag"
-    store = get_typestore(Stores.ROS1_NOETIC if first else Stores.ROS2_HUMBLE)
-    if first:
-        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
-    plugin = StoragePlugin.MCAP if path.suffix == ".mcap" else StoragePlugin.SQLITE3
-    folder = path.with_suffix("")
-    with Writer1(path) if first else Writer2(folder, version=9, storage_plugin=plugin) as writer:
-        for topic, (kind, make) in topics.items():
-            connection = writer.add_connection(topic, kind, typestore=store)
-            for k in range(len(TIMES)):
-                message = make(k, store.types)
-                data = (store.serialize_ros1 if first else store.serialize_cdr)(message, kind)
-                writer.write(connection, int(NANOSECONDS[k]) + 10**9, data)
-    return path if first else next(folder.glob(f"*{path.suffix}"))
-
-
-def header(k, types):
-    stamp = types["builtin_interfaces/msg/Time"](int(NANOSECONDS[k] // 10**9), int(NANOSECONDS[k] % 10**9))
-    fields = {"stamp": stamp, "frame_id": "base"}
-    kind = types["std_msgs/msg/Header"]
-    return kind(**fields, seq=k) if "seq" in kind.__dataclass_fields__ else kind(**fields)
-
-
-def pose(k, types, part="Pose", places=("position", "orientation"), point="Point"):
-    vector, turn = (
-        types[f"geometry_msgs/msg/{point}"](*path_of()[k]),
-        types["geometry_msgs/msg/Quaternion"](*turns_of()[k]),
-    )
-    return types[f"geometry_msgs/msg/{part}"](**dict(zip(places, (vector, turn), strict=True)))
-
-
-def pose_stamped(k, types):
-    return types["geometry_msgs/msg/PoseStamped"](header(k, types), pose(k, types))
-
-
-def transforms(k, types):
-    moving = pose(k, types, "Transform", ("translation", "rotation"), "Vector3")
-    fixed = pose(0, types, "Transform", ("translation", "rotation"), "Vector3")
-    stamped = types["geometry_msgs/msg/TransformStamped"]
-    return types["tf2_msgs/msg/TFMessage"](
-        [stamped(header(k, types), "camera", fixed), stamped(header(k, types), "tool0", moving)]
-    )
-
-
-def joint_state(k, types):
-    q = TestJoints.Q[k, ::-1].copy()
-    return types["sensor_msgs/msg/JointState"](header(k, types), ["elbow", "shoulder"], q, np.zeros(2), np.zeros(2))
-
-
-POSE = {"/ee": ("geometry_msgs/msg/PoseStamped", pose_stamped)}
-TF = {"/tf": ("tf2_msgs/msg/TFMessage", transforms)}
-STATES = {"/joint_states": ("sensor_msgs/msg/JointState", joint_state)}
-TEXTS = {"/log": ("std_msgs/msg/String", lambda k, types: types["std_msgs/msg/String"]("hello"))}
 
 
 class TestBags:
@@ -574,7 +457,7 @@ class TestBags:
     @pytest.mark.parametrize("suffix", [".mcap", ".db3", ".bag"])
     def test_joint_states_become_places_by_the_arm(self, tmp_path, suffix):
         path = bag(tmp_path / f"take{suffix}", STATES | TEXTS)
-        assert_same(load_demonstrations(path, arm=Planar())[0], Planar().end_effector(TestJoints.Q))
+        assert_same(load_demonstrations(path, arm=Planar())[0], Planar().end_effector(ANGLES))
         with pytest.raises(DemonstrationError, match=r"angles of 2 joints \(elbow, shoulder\)"):
             load_demonstrations(path)
 
@@ -635,53 +518,6 @@ def test_a_gigabyte_is_refused_by_its_size(tmp_path):
         with pytest.raises(DemonstrationError, match=r"found 1000\.0 MB; accepted: at most"):
             load_demonstrations(path)
         path.unlink()
-
-
-def good_files(folder):
-    """A file of each kind."""
-    np.savez(folder / "a.npz", times=TIMES, positions=path_of())
-    np.save(folder / "a.npy", path_of())
-    scipy.io.savemat(folder / "a.mat", {"t": TIMES, "pos": path_of().T})
-    (folder / "a.json").write_text(
-        json.dumps([{"t": t, "pos": p} for t, p in zip(TIMES.tolist(), path_of().tolist(), strict=True)])
-    )
-    for suffix in (".csv", ".tsv", ".txt", ".dat"):
-        (folder / f"a{suffix}").write_bytes(table(["t", "x", "y", "z"], [TIMES, *path_of().T]))
-    with suppress(pytest.skip.Exception):
-        robomimic(folder / "a.hdf5")
-        (folder / "a.h5").write_bytes((folder / "a.hdf5").read_bytes())
-    with suppress(pytest.skip.Exception):
-        lerobot(folder / "lerobot", ["x", "y", "z"])
-        next((folder / "lerobot").rglob("*.parquet")).rename(folder / "a.parquet")
-    with suppress(pytest.skip.Exception):
-        for suffix in (".mcap", ".db3", ".bag"):
-            bag(folder / f"bag{suffix[1:]}{suffix}", POSE).rename(folder / f"a{suffix}")
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("good")
-    good_files(folder)
-    return folder
-
-
-@pytest.mark.parametrize("suffix", [suffix for suffix in READERS if suffix not in (".tsv", ".txt", ".dat", ".h5")])
-def test_mutated_files_are_read_or_refused(files, suffix):
-    if not (path := files / f"a{suffix}").exists():
-        pytest.skip(f"nothing writes {suffix} here")
-    content, rng = path.read_bytes(), np.random.default_rng(len(suffix))
-    assert len(read_demonstrations(content, path, arm=Planar())) > 0
-    for k in range(300):
-        changed = bytearray(content[: int(rng.integers(len(content)))] if k % 3 == 0 else content)
-        for place in rng.integers(len(changed), size=rng.integers(1, 9)) if changed else ():
-            changed[place] = int(rng.integers(256))
-        try:
-            read = read_demonstrations(bytes(changed), path, arm=Planar())
-        except DemonstrationError as error:
-            assert len(str(error)) < 1000 and "\n" not in str(error)
-        else:
-            for demonstration in read:
-                assert np.isfinite(demonstration.positions).all() and (np.diff(demonstration.times) > 0).all()
 
 
 class Panda:

@@ -10,6 +10,7 @@ from dt_viz.metrics import discrete_frechet, resample_by_arc_length
 from dt_viz.robot.inverse_kinematics import inverse_kinematics, track
 from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.stack import WHOLE_ARM
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.frame import Stage
 from dt_viz.warning import Kind
@@ -111,4 +112,4 @@ def test_nothing_is_to_be_warned_of_on_the_way_around_the_first_obstacle(name, s
     assert all(w.kind is Kind.ARM_TOO_NEAR or w in meshes for w in frame.certificates.warnings)
     if space != "task":
         least = 0.01 if name == "drop_pots" else 0.1  # there the arm only just grazes it
-        assert meshes == () and frame.arm_duration > least  # it is in the arm's way, too
+        assert meshes == () and frame.durations[WHOLE_ARM] > least  # it is in the arm's way, too

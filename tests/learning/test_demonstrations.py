@@ -183,45 +183,6 @@ class TestNpz:
 
 
 class TestCsv:
-    def test_labels_make_demonstrations(self):
-        text = "demo,t,x,y,z\r\nb,0,1,2,3\r\nb,0.5,2,2,3\r\na,3,1,1,1\r\na,4,2,2,2\r\n"
-        b, a = read_demonstrations(text.encode("utf-8-sig"), "two.csv")
-        assert (b.name, a.name) == ("b", "a")
-        np.testing.assert_array_equal(b.positions, [[1, 2, 3], [2, 2, 3]])
-        np.testing.assert_array_equal(a.times, [0, 1])
-
-    def test_without_labels_the_file_is_one_demonstration(self):
-        (only,) = read_demonstrations(b"T, X, Y\n0, 1, 2\n\n1, 2, 3\n", "wave.CSV")
-        assert only.name == "wave" and only.dimension == 2
-
-    @pytest.mark.parametrize(
-        ("header", "used"),
-        [
-            ("z,y,x,t,demo", "z,y,x,t,demo"),
-            ("timestamp,pos_x,pos_y,pos_z,qx,qy,qz,qw", "t,x,y,z"),
-            ("time_ms,position.x,position.y,position.z", "t,x,y,z"),
-            ("%time,field.header.seq,field.pose.position.x,field.pose.position.y,field.pose.position.z", "t,,x,y,z"),
-            ("Stamp [ns], px, py, pz, other_px", "t,x,y,z"),
-        ],
-    )
-    def test_columns_are_found_by_their_names_in_any_order_and_others_are_said(self, header, used, caplog):
-        names = used.split(",") + [""] * (header.count(",") - used.count(","))
-        unit = 1e3 if "ms" in header else 1e9 if "ns" in header or "%" in header else 1.0
-        rows = [
-            ",".join(
-                {"t": f"{unit * 0.5 * k:g}", "x": f"{k}", "y": "2", "z": "3", "demo": "a"}.get(n, "9") for n in names
-            )
-            for k in range(3)
-        ]
-        (only,) = read_demonstrations("\n".join([header, *rows]).encode(), "run.csv")
-        np.testing.assert_allclose(only.positions, [[0, 2, 3], [1, 2, 3], [2, 2, 3]])
-        np.testing.assert_allclose(only.times, [0, 0.5, 1])
-        assert only.name == ("a" if "demo" in names else "run")
-        unused = [cell.strip().lower() for cell, name in zip(header.split(","), names, strict=True) if not name]
-        assert [message.partition(" are not used")[0] for message in caplog.messages] == (
-            [f"run.csv: columns {', '.join(unused)}"] if unused else []
-        )
-
     def test_samples_without_times_are_even(self, caplog):
         text = b"demo,x,y,z\na,0,0,0\na,1,0,0\na,2,0,0\nb,1,0,0\nb,2,0,0\n"
         a, b = read_demonstrations(text, "a.csv", rate=50)

@@ -14,8 +14,6 @@ from dt_viz.flows.integrators import EULER, IMPLICIT_EULER, carried
 from dt_viz.learning.demonstrations import Demonstration, load_demonstrations
 from dt_viz.learning.flow_chain import FlowChain, FlowLayer, equally_spaced_grid, min_step_determinant
 from dt_viz.learning.imitation import Imitation, ImitationSettings, fit
-from dt_viz.learning.initial_guess import unbending
-from dt_viz.learning.inspection import PreparationSettings
 from dt_viz.learning.preparation import ImitationError
 from dt_viz.learning.velocity import VelocityFit
 from dt_viz.shipped import ASSETS
@@ -58,14 +56,6 @@ def test_inducing_points_that_are_not_evenly_spaced_are_refused(learned):
     arrays = learned[1].to_arrays() | {"layer_1_axis_0": np.array([0.0, 0.1, 0.25])}
     with pytest.raises(FormatError, match=r"layer_1_axis_0.*uneven"):
         Imitation.from_arrays(arrays)
-
-
-def test_its_clock_is_known_three_knots_beyond_the_farthest_start(learned):
-    _, imitation = learned
-    base = imitation.system.base
-    radii = np.linalg.norm(imitation.system.transform.forward(imitation.starts) - base.goal, axis=1)
-    clock = base.smoothing / base.speed * np.log(np.sinh(radii.max() / base.smoothing))
-    np.testing.assert_allclose(base.knots[-4], clock, atol=1e-9)
 
 
 def test_progress_never_goes_back():
@@ -127,15 +117,9 @@ def test_units_and_place_do_not_matter(learned):
     np.testing.assert_allclose(large.system.rollout(large.starts, times), expected, atol=1e-5)
 
 
-def test_a_single_demonstration_is_enough():
-    demonstrations = hooks(2, num=1)
-    assert mean_error(demonstrations, fit(demonstrations)) < 0.002
-
-
-def test_groups_of_starts_on_opposite_sides_share_one_goal():
-    one = hooks(2, num=3)
-    other = [Demonstration(d.times, -d.positions, d.name + " turned") for d in hooks(2, num=3, seed=1)]
-    assert mean_error(one + other, fit(one + other)) < 0.003
+@pytest.mark.parametrize("groups", [hooks(2, num=1), hooks(2, num=3) + hooks(2, num=3, seed=1, scale=-1.0)])
+def test_a_single_demonstration_and_starts_on_opposite_sides_of_one_goal_are_enough(groups):
+    assert mean_error(groups, fit(groups)) < 0.003
 
 
 def test_a_motion_that_turns_twice_round_gets_more_layers():
@@ -165,16 +149,6 @@ def test_the_fitted_chain_is_the_transform_and_sensitivities_are_the_derivatives
     centre, scale = np.arange(3.0, 3.0 + dim), 0.05
     transform = chain.transform(thetas, centre, scale)
     np.testing.assert_allclose(transform.inverse(centre + scale * points), centre + scale * x, atol=1e-14)
-
-
-def test_unbending_ends_in_the_motions_and_begins_with_straight_rays():
-    motions = 10 * np.stack([d.positions[:: len(d.positions) // 40][:40] for d in hooks(2)])
-    motions[:, -1] = 0
-    shapes = unbending(motions, 2, 3.0, 8)
-    np.testing.assert_allclose(shapes[-1], motions, atol=1e-9)
-    assert all(np.abs(shape[:, -1]).max() < 1e-9 for shape in shapes)
-    offsets = shapes[0] - shapes[0][:, -1:]
-    np.testing.assert_allclose(offsets, np.linspace(1, 0, 40)[:, None] * offsets[:, :1], atol=1e-9)
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -270,17 +244,6 @@ def still(place=0.3):
     return Demonstration(np.linspace(0, 1, 50), np.full((50, 2), place), "still")
 
 
-def with_a_pause():
-    """The first of the hooks, on which a point comes sixty times."""
-    path, middle = hooks(2)[0].positions, 40
-    path = np.concatenate([path[:middle], np.repeat(path[[middle]], 60, axis=0), path[middle:]])
-    return changed(0, path, np.linspace(0, 4, len(path)))
-
-
-def without_the_pause():
-    return changed(0, times=np.linspace(0, 4 * 79 / 139, 80))
-
-
 @pytest.mark.parametrize(
     ("demonstrations", "warning", "num_left", "largest_error"),
     [
@@ -300,24 +263,10 @@ def test_what_is_odd_is_named_and_the_rest_is_learned(demonstrations, warning, n
     assert imitation.min_det_jacobian > 0
 
 
-@pytest.mark.parametrize("cut", [True, False])
-def test_a_pause_of_one_take_is_cut_or_learned(cut):
-    settings = ImitationSettings(preparation=PreparationSettings(cut_pauses=cut))
-    imitation = fit(with_a_pause(), settings)
-    assert any(re.search("'hook 0' stands still for 1.7 s; ", text) for text in imitation.warnings)
-    assert mean_error(without_the_pause() if cut else with_a_pause(), imitation) < 0.003
-
-
-def with_a_value(value):
+def with_nan():
     path = hooks(2)[1].positions.copy()
-    path[7, 1] = value
+    path[7, 1] = np.nan
     return changed(1, path)
-
-
-def with_a_time_twice():
-    times = hooks(2)[3].times.copy()
-    times[5] = times[4]
-    return changed(3, times=times)
 
 
 def apart():
@@ -332,9 +281,7 @@ def apart():
         (apart(), "no common goal"),
         ([still()], "moves"),
         ([still(0.0)], "moves"),
-        (with_a_value(np.nan), r"'hook 1': found .* at sample 8"),
-        (with_a_value(np.inf), r"'hook 1': found .* at sample 8"),
-        (with_a_time_twice(), r"'hook 3': found .* at sample 6"),
+        (with_nan(), r"'hook 1': found .* at sample 8"),
         ([], "demonstrations: found none"),
     ],
 )

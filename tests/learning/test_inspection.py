@@ -92,6 +92,14 @@ def test_a_gap_is_bridged_by_a_curve_unless_that_is_switched_off():
     assert "straight line" in straight.warnings[0] and "curve" in motions.warnings[0]
 
 
+def test_several_gaps_are_bridged_by_straight_lines():
+    own = TASKS["draw_s"]().demonstrations[0]
+    kept = [k for k in range(len(own.times)) if k not in {*range(40, 60), *range(100, 120)}]
+    take = replace(own, times=own.times[kept], positions=own.positions[kept])
+    motions = prepare([take], PreparationSettings(bridge_gaps=False))
+    assert motions.warnings[0].endswith(", 2 gaps; bridged by a straight line") and motions.repaired == (take,)
+
+
 def test_a_pause_of_most_takes_belongs_to_the_motion_but_not_one_before_it_begins():
     own = TASKS["draw_s"]().demonstrations[0]
     even = np.linspace(0.0, own.times[-1] + 1.5, 400)

@@ -286,41 +286,23 @@ def test_a_cancelled_fit_ends_and_leaves_nothing_behind(tmp_path, gated, learned
     assert noted["calls"] == [2, 2]
 
 
-def test_a_fit_is_made_once_for_all_who_wait(tmp_path, gated, learned):
+@pytest.mark.parametrize("leaves", ["the maker", "another"])
+def test_a_fit_is_made_once_for_all_who_wait_and_by_another_where_its_maker_gives_up(tmp_path, gated, learned, leaves):
     gates, noted = gated
     store = FitStore(tmp_path)
-    maker = Visitor(store, 2)
-    assert maker.reported.wait(30)
-    leaves, *others = (Visitor(store, 2) for _ in range(3))
-    for visitor in (leaves, *others):
-        assert visitor.reported.wait(30)  # each is told how far the fit is that one of them makes
-    leaves.gives_up.set()
-    leaves.join()
-    assert isinstance(leaves.error, Cancelled)
-    assert all(visitor.thread.is_alive() for visitor in others)
+    visitors = []
+    for _ in range(4):
+        visitors.append(Visitor(store, 2))
+        assert visitors[-1].reported.wait(30)  # each is told how far the fit is that the first one makes
+    left = visitors.pop(0 if leaves == "the maker" else 1)
+    left.gives_up.set()
+    left.join()
+    assert isinstance(left.error, Cancelled) and all(visitor.thread.is_alive() for visitor in visitors)
     gates[2].set()
-    for visitor in (maker, *others):
+    for visitor in visitors:
         visitor.join()
         assert visitor.result is learned
-    assert noted["calls"] == [2]
-
-
-def test_where_its_maker_gives_up_another_who_waits_makes_it(tmp_path, gated, learned):
-    gates, noted = gated
-    store = FitStore(tmp_path)
-    maker = Visitor(store, 2)
-    assert maker.reported.wait(30)
-    others = [Visitor(store, 2) for _ in range(3)]
-    for visitor in others:
-        assert visitor.reported.wait(30)
-    maker.gives_up.set()
-    maker.join()
-    assert isinstance(maker.error, Cancelled) and all(visitor.thread.is_alive() for visitor in others)
-    gates[2].set()
-    for visitor in others:
-        visitor.join()
-        assert visitor.result is learned
-    assert noted["calls"] == [2, 2]
+    assert noted["calls"] == ([2, 2] if leaves == "the maker" else [2])
 
 
 def test_who_waits_can_give_up_although_the_fit_says_nothing(tmp_path, monkeypatch, learned):

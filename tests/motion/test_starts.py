@@ -15,7 +15,7 @@ from dt_viz.motion.nominal import Nominal
 from dt_viz.motion.stack import FINE, LIVE, build_stack
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.scenario import Start, View
-from dt_viz.scenario.stack import plane_of
+from dt_viz.scenario.stack import WHOLE_ARM, plane_of
 from dt_viz.scenario.starts import with_grid
 from dt_viz.session.frame import Stage
 
@@ -81,7 +81,7 @@ def test_the_whole_arm_makes_way_for_the_task_and_names_the_added_starts_that_it
     area, reaches = engine.task("draw_s").slice, engine.follower.robot.reaches
     grid = with_grid(changed(scenario, space="task"), area, lambda places: np.zeros(len(places)), reaches)
     alone, frame = (frame_at(engine, replace(scenario, starts=starts), Stage.LIVE) for starts in ((), grid.starts))
-    assert frame.arm_duration == pytest.approx(alone.arm_duration, rel=1e-3)
+    assert frame.durations[WHOLE_ARM] == pytest.approx(alone.durations[WHOLE_ARM], rel=1e-3)
     assert frame.certificates.clearance == pytest.approx(alone.certificates.clearance, abs=1e-4)
     for path, other in zip(alone.rollouts, frame.rollouts, strict=False):
         assert max(np.linalg.norm(other - point, axis=1).min() for point in path) < 5e-3

@@ -88,7 +88,7 @@ def test_the_base_attractor_has_straight_motions_and_a_lattice(engine, initial, 
         assert (np.abs(base.area.across(line)) <= half).all()
     assert min(np.ptp(base.area.across(line), axis=0).min() for line in base.grid) < 1e-9
     np.testing.assert_array_equal(own.area.centre, engine.task(name).slice.centre)
-    assert frame_of(engine, initial(name), BASE_PANEL, field=False).pictures.panels[0].grid == ()
+    assert len(frame_of(engine, initial(name), BASE_PANEL, field=False).pictures.panels[0].grid) == 0
 
 
 def test_each_level_has_its_own_rollouts_and_streamlines(engine, initial):
@@ -120,7 +120,7 @@ def test_the_field_between_two_levels_leads_from_one_to_the_other(engine, initia
     led = transform.scaled(part).inverse(points) - points
     size = np.linalg.norm(panel.vectors, axis=1)
     scale = np.einsum("ij,ij->", led, panel.vectors) / (size**2).sum()
-    assert scale > 0 and len(points) > 30
+    assert scale > 0 and len(points) >= 30
     np.testing.assert_allclose(led, scale * panel.vectors, atol=0.02 * np.linalg.norm(led, axis=1).max())
     assert (np.abs(own.area.across(points)) < own.area.half_size).all()
 

@@ -13,7 +13,7 @@ from dt_viz.metrics import maximum_collision_distance, resample_by_arc_length
 from dt_viz.obstacles.shapes import CloudObstacle, MeshObstacle, Sphere
 from dt_viz.scenario.paper_scenes import CLOVER, SCENES, Clover, offered
 from dt_viz.scenario.scenario import View
-from dt_viz.scenario.stack import anchored
+from dt_viz.scenario.stack import WHOLE_ARM, anchored
 from dt_viz.scenario.tasks import POTS, TASKS, known_tasks
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Stage
@@ -96,7 +96,7 @@ def test_the_whole_arm_gives_way_to_a_standing_bottle_and_reaches_the_goal(live,
     undisturbed = max(maximum_collision_distance(path, bottle.signed_distance) for path in frame.ghost)
     assert undisturbed > 0.01  # it is in the way
     assert frame.certificates.clearance > 0
-    assert frame.arm_duration > 0
+    assert frame.durations[WHOLE_ARM] > 0
     np.testing.assert_allclose(frame.reached, frame.goal, atol=1e-3)
 
 

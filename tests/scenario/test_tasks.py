@@ -7,7 +7,7 @@ from scipy.io import savemat
 from dt_viz.learning.demonstrations import Demonstration, DemonstrationError
 from dt_viz.robot.inverse_kinematics import inverse_kinematics
 from dt_viz.robot.models import load_jaco
-from dt_viz.scenario.tasks import DRAWING_SIZE, POTS, TASKS, lasa_tasks, own_task
+from dt_viz.scenario.tasks import DRAWING_SIZE, POTS, TASKS, known_tasks, own_task
 
 
 def write_shape(path, dim):
@@ -22,7 +22,7 @@ def write_shape(path, dim):
 
 def test_each_file_of_a_folder_becomes_a_task_before_the_robot(tmp_path):
     write_shape(tmp_path / "Line.mat", 2)
-    entry = lasa_tasks(tmp_path)["Line"]
+    entry = known_tasks(tmp_path)["Line"]
     task = entry()
     assert entry.title == task.title == "LASA Line"
     points = np.concatenate(task.paths)
@@ -33,7 +33,7 @@ def test_each_file_of_a_folder_becomes_a_task_before_the_robot(tmp_path):
 def test_a_file_in_space_is_refused_and_named(tmp_path):
     write_shape(tmp_path / "Solid.mat", 3)
     with pytest.raises(DemonstrationError, match=r"Solid.mat: pos: found 3 coordinates; accepted: 2"):
-        lasa_tasks(tmp_path)["Solid"]()
+        known_tasks(tmp_path)["Solid"]()
 
 
 def test_the_arm_reaches_above_and_into_every_pot_which_catches_what_is_let_go_over_its_opening_only():

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from arm_files import urdf, write
 from other_arms import seven_joints
+from pages import NoFrames
 from scenes import avoiding
 
 from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.errors import UnwantedError
 from dt_viz.memo import Memo
-from dt_viz.motion.following import Follower
 from dt_viz.obstacles.shapes import Box, Cylinder, Sphere
 from dt_viz.robot import making, models
 from dt_viz.robot.models import ARMS, NotStoredError, load_arm
@@ -29,7 +29,6 @@ from dt_viz.session import arms as arms_module
 from dt_viz.session.arms import ArmStore, Engines
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Stage
-from dt_viz.session.robot_loop import LiveArm
 from dt_viz.session.session import CHOICES, Session
 from dt_viz.session.tasks_in_reach import in_reach
 
@@ -43,20 +42,15 @@ class Sketch:
         self.scenario, self.stage, self.passing = scenario, stage, None
 
 
-class Sketches:
+class Sketches(NoFrames):
     """An engine whose frames are empty."""
 
-    bring, adopt = Engine.bring, Engine.adopt
-
     def __init__(self, robot, tasks=TASKS):
-        self.follower, self.tasks, self.seen = Follower(robot), tasks, []
-        self.arm, self.own, self._last = LiveArm(self.follower), {}, {}
+        super().__init__(robot)
+        self.tasks, self.seen = tasks, []
 
     def task(self, name):
         return self.own[name][0] if name in self.own else self.tasks[name]()
-
-    def title(self, name):
-        return self.tasks[name].title
 
     def see(self, scenario):
         self.seen.append(scenario.arm)
@@ -64,8 +58,8 @@ class Sketches:
     def drive(self, frame):
         pass
 
-    def frames(self, scenario, *_how):
-        return (Sketch(scenario, stage) for stage in Stage)
+    def frames(self, *what):
+        return (Sketch(what[0], stage) for stage in Stage)
 
 
 class Display:

@@ -7,14 +7,12 @@ import numpy as np
 import pytest
 from crossings import crossings
 from drawings import frechet
-from oracles import central_differences
 from scenes import avoiding, biases, changed, kinds, starts_at
 
 import dt_viz as dt
 from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.control.controller import ArmController, Phase
 from dt_viz.errors import DataError, FormatError
-from dt_viz.evaluate.held_out import path_from
 from dt_viz.learning.augmented import fit_augmented
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.imitation import ImitationSettings
@@ -22,8 +20,6 @@ from dt_viz.learning.interface import STATES
 from dt_viz.learning.patterns import AugmentedSettings
 from dt_viz.learning.preparation import ImitationError, prepare
 from dt_viz.learning.state import learn
-from dt_viz.metrics import distance_from_path
-from dt_viz.motion.certificates import Certificates, DrawnSamples, certified
 from dt_viz.motion.stack import FINE, LIVE
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.scenario.panels import Panel
@@ -32,6 +28,7 @@ from dt_viz.scenario.scenario import Scenario, Start
 from dt_viz.scenario.tasks import TASKS, TaskEntry, drawing_task
 from dt_viz.session.frame import Stage
 from dt_viz.warning import Kind
+from tests.benchmarks.learning import path_from
 
 EIGHT = "draw_8"
 TICK = 0.01
@@ -148,14 +145,6 @@ def test_labels_that_do_not_tell_what_was_drawn_are_said():
         learn(demonstrations, state="augmented", labels=3 * ("left", "right"))  # type: ignore[arg-type]
 
 
-def test_labels_follow_the_demonstrations_in_whatever_order_they_come():
-    demonstrations, order = ways((-0.1, 0.1)), np.random.default_rng(0).permutation(6)
-    imitation = augmented([demonstrations[k] for k in order])
-    up = np.array([demonstrations[k].positions[:, 1].mean() > 0 for k in order])
-    first = -1.0 if up[0] else 1.0
-    np.testing.assert_array_equal(imitation.labels, np.where(up, first, -first))
-
-
 @pytest.mark.parametrize("task", TASKS)
 def test_one_pattern_gets_no_labels(fits, task):
     imitation = fits.learned(TASKS[task]().demonstrations, state="augmented")
@@ -174,17 +163,6 @@ def test_what_labels_cannot_tell_apart_is_said():
     imitation = learn(demonstrations, state="augmented", augmented=AugmentedSettings(max_patterns=2))
     assert "a motion misses its demonstration by" in imitation.warnings[-1]
     assert not learn(demonstrations, state="augmented").warnings
-
-
-def test_five_ways_are_told_apart():
-    assert len(found_labels(ways((-0.2, -0.1, 0.0, 0.1, 0.2)))) == 5
-
-
-def test_demonstrations_that_are_left_out_do_not_shift_the_labels():
-    still = Demonstration(np.linspace(0, 1, 50), np.zeros((50, 2)), "still")
-    demonstrations = ways((-0.1, 0.1))
-    imitation = augmented((demonstrations[0], still, *demonstrations[1:]))
-    np.testing.assert_array_equal(np.delete(np.array(imitation.labels), 1), 3 * (-1.0, 1.0))
 
 
 def with_ways(new_engine):
@@ -235,22 +213,6 @@ def test_wrong_choices_are_named():
 # --- The system ---
 
 
-@pytest.mark.parametrize("name", ["wide eight", "left and right from one start", "helix, 2 turns"])
-def test_the_learned_shear_changes_with_the_condition_as_it_says(name):
-    case, rng = CASES[name], np.random.default_rng(0)
-    imitation = fit_augmented(case.demonstrations, case.labels)
-    psi, states = (
-        imitation.system.transform,
-        imitation.demonstrated(np.stack([d.positions[0] for d in case.demonstrations])),
-    )
-    states[:, imitation.dim] *= rng.uniform(0.1, 0.9, len(states))
-    states += 0.01 * rng.normal(size=states.shape)
-    image, J = psi.jacobian(states)
-    np.testing.assert_allclose(np.linalg.det(J), 1.0, atol=1e-9)
-    np.testing.assert_allclose(psi.inverse(image), states, atol=1e-14)
-    np.testing.assert_allclose(J, central_differences(psi.forward, states, 1e-6), atol=2e-5)
-
-
 def test_in_the_world_motions_are_those_of_the_drawing_placed_there():
     case, rng = CASES["left and right from one start"], np.random.default_rng(1)
     drawn = fit_augmented(case.demonstrations, case.labels)
@@ -296,16 +258,6 @@ def test_the_8_is_drawn_as_demonstrated(engine):
     assert max(frechet(a, b) for a, b in zip(plain.rollouts, plain.task.paths, strict=True)) > 0.08
 
 
-def test_certificates_recognise_motions_of_other_conditions(engine):
-    solved = engine.solved(in_the_way(engine), FINE)
-    stack, bundle = solved.stack, solved.stack.bundle
-    times = stack.rays.times(bundle.index, bundle.fraction)
-    shown = DrawnSamples(bundle.index, bundle.fraction, times, bundle.positions, len(solved.nominal.status))
-    assert not certified(Certificates(0.01), stack, shown).warnings
-    another = replace(stack, rays=replace(stack.rays, z0=np.roll(stack.rays.z0, 1, axis=0)))
-    assert Kind.OFF_MOTION in kinds(certified(Certificates(0.01), another, shown).warnings)
-
-
 def test_an_added_start_draws_the_8_from_there(engine):
     task = engine.task(EIGHT)
     start = as_point(task.starts.mean(axis=0) + np.array([0.05, 0.0, 0.04]))
@@ -313,15 +265,6 @@ def test_an_added_start_draws_the_8_from_there(engine):
     added, mean = frame.rollouts[-1], task.mean_path
     shifted = mean + np.linspace(1, 0, len(mean))[:, None] * (start - mean[0])
     assert frechet(added, shifted) < 0.02 and not frame.certificates.warnings
-
-
-def test_half_warped_it_is_between_a_straight_line_and_the_8(engine):
-    straight, halfway, whole = (last(engine, Scenario(EIGHT, (), warp=warp)) for warp in (0.0, 0.5, 1.0))
-    assert not halfway.certificates.warnings
-    for line, half, figure in zip(straight.rollouts, halfway.rollouts, whole.rollouts, strict=True):
-        apart, from_both = frechet(line, figure), [frechet(half, line), frechet(half, figure)]
-        assert 0.2 * apart < min(from_both) and max(from_both) < 0.9 * apart
-        assert distance_from_path(line, line[[0, -1]]).max() < 1e-9
 
 
 def test_the_whole_arm_gives_way(engine):
@@ -466,23 +409,6 @@ def test_the_arm_draws_the_pattern_of_the_rollout_that_it_begins(new_engine, rol
 
 
 # --- The library ---
-
-
-@pytest.mark.parametrize("label", [-1.0, 1.0])
-def test_the_arm_in_the_loop_draws_the_pattern_of_its_label(label):
-    across, down = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, -1.0])
-    turned = [
-        replace(d, positions=np.array([0.1, -0.5, 0.15]) - d.positions[:, :1] * down + d.positions[:, 1:] * across)
-        for d in ways((-0.1, 0.1), jitter=0.0)
-    ]
-    motion, arm = dt.fit(turned, state="augmented"), dt.load_jaco()
-    (path, *_), (other, *_) = motion.rollouts(label=label), motion.rollouts(label=-label)
-    controller, q = dt.Controller(motion, arm, label), arm.follow(path).q[0]
-    controller.begin(q)
-    hand, _ = drawn(arm.robot, controller, q)
-    assert farthest_from(hand, path.positions) < 0.01 and farthest_from(hand, other.positions) > 0.05
-    with pytest.raises(FormatError, match="label: found 3"):
-        dt.Controller(motion, arm, 3.0)
 
 
 def test_velocities_and_phase_are_what_rollouts_are_made_of():

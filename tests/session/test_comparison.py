@@ -9,10 +9,7 @@ from pages import frame_of
 from scenes import avoiding, changed
 
 from dt_viz.baselines.base import NotFittedError
-from dt_viz.baselines.eflow import EFlow
-from dt_viz.baselines.mpnet import MPNet
 from dt_viz.baselines.registry import METHODS, problem_of
-from dt_viz.baselines.repulsive import EFlowRepulsive
 from dt_viz.errors import UnwantedError
 from dt_viz.evaluate.held_out import frechet
 from dt_viz.evaluate.table1 import drawn
@@ -41,7 +38,7 @@ def by_name(frame):
     return {compared.method.name: compared for compared in frame.comparison}
 
 
-def straight(_method, problem):
+def straight(problem):
     """In the place of MPNet's planner, which takes seconds to find most of the same motions."""
     return METHODS[LIVE].fit(problem)
 
@@ -49,7 +46,7 @@ def straight(_method, problem):
 @pytest.fixture
 def quick(monkeypatch):
     """The slow method plans at once; it waits for its turn all the same."""
-    monkeypatch.setattr(MPNet, "fit", straight)
+    monkeypatch.setitem(vars(METHODS["mpnet"]), "fit", straight)
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +55,7 @@ def beside(new_engine, initial):
     engine = new_engine()
     scenario = shown(changed(initial("push_box"), space="cspace"), LIVE, SLOW)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(MPNet, "fit", straight)
+        patch.setitem(vars(METHODS["mpnet"]), "fit", straight)
         return engine, scenario, list(engine.frames(scenario))
 
 
@@ -78,7 +75,7 @@ def test_quick_methods_follow_a_drag_and_slow_ones_come_one_after_the_other(besi
 @pytest.mark.usefixtures("quick")
 def test_while_slow_methods_are_planned_the_frames_say_which_and_how_many_are_left(new_engine, initial, monkeypatch):
     engine, first, second = new_engine(), "eflow-repulsive", SLOW
-    monkeypatch.setattr(EFlowRepulsive, "live", False)
+    monkeypatch.setitem(vars(METHODS["eflow-repulsive"]), "live", False)
     planned = type(engine.comparison)._planned
     begun = []
 
@@ -126,7 +123,7 @@ def test_scores_are_those_of_the_motions(beside):
         ends = max(np.linalg.norm(path[-1] - goal) for path in compared.paths)
         assert compared.scores.goal_error == pytest.approx(ends, abs=1e-9)
     planner = METHODS[LIVE].fit(problem_of(engine.nominal(scenario).learned, engine.follower))
-    joints = planner.plan(scenario.obstacle, task.starts).joints
+    joints = planner(scenario.obstacle, task.starts).joints
     assert joints is not None
     nearest = min(load_jaco().collision.nearest_to_obstacle(q, scenario.obstacle).distance for q in joints)
     assert last[LIVE].scores.arm_depth == pytest.approx(max(0.0, -nearest), abs=1e-3)
@@ -189,9 +186,9 @@ def test_a_method_that_cannot_plan_says_why(new_engine, initial, monkeypatch, wh
         raise NotFittedError(why)
 
     if why.startswith("needs"):
-        monkeypatch.setattr(EFlow, "needs", ("x_y_z_not_there",))
+        monkeypatch.setitem(vars(METHODS["eflow"]), "needs", ("x_y_z_not_there",))
     else:
-        monkeypatch.setattr(EFlow, "fit", fit)
+        monkeypatch.setitem(vars(METHODS["eflow"]), "fit", fit)
     *_, frame = new_engine().frames(shown(initial("push_box"), "eflow", LIVE))
     found = by_name(frame)
     assert why in found["eflow"].note and not found["eflow"].paths and found["eflow"].scores is None
@@ -260,7 +257,7 @@ def test_methods_are_chosen_in_the_order_of_the_tables_and_their_arm_with_them()
 def test_what_is_not_installed_is_grey_with_the_command(server, monkeypatch):
     monkeypatch.setattr("dt_viz.baselines.base.find_spec", lambda _module: None)
     panel = ComparePanel(server.gui, Bindings())
-    assert not panel.folder.visible
+    assert not panel.table.visible
     boxes = {box.label: box for box in server.gui._gui_input_handle_from_uuid.values() if hasattr(box, "label")}
     assert boxes["MPNet-RRT"].disabled and not boxes["Modulation"].disabled
     assert 'pip install "dt-viz[baselines]"' in hint(METHODS["mpnet-rrt"])

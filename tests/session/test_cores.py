@@ -87,13 +87,6 @@ def test_refinements_leave_a_slot_to_who_follows_a_hand(crowd):
     assert crowd.order[-1] == "e"  # though a refinement came before it
 
 
-@pytest.mark.parametrize("crowd", [[2]], indirect=True)
-def test_all_slots_serve_hands(crowd):
-    for name in "abc":
-        crowd.come(name)
-    assert crowd.order == ["a", "b"]
-
-
 @pytest.mark.parametrize("crowd", [[2, 1]], indirect=True)
 def test_a_refinement_begins_beside_a_hand_but_not_while_another_one_waits(crowd):
     for name in "abC":

@@ -176,12 +176,6 @@ def test_resting_work_is_woken_by_the_next(jobs, latest):
     assert jobs.done == [True, "next"]
 
 
-def test_a_rest_ends_by_itself(jobs):
-    jobs.submit(LANE, lambda: (jobs.rest(LANE, 0.01), jobs.done.append(jobs.superseded(LANE))))
-    jobs.settle()
-    assert jobs.done == [False]
-
-
 def test_closing_lets_running_work_end_and_drops_what_waits_and_what_comes_later(jobs):
     gate = Gate()
     jobs.submit(LANE, lambda: (gate(), jobs.done.append(jobs.superseded(LANE))))

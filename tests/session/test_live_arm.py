@@ -120,17 +120,6 @@ def test_it_goes_from_start_to_goal_and_home_to_the_next_start(begin, initial, t
         assert {Phase.MOVING, Phase.HOMING, Phase.RESTING} >= set(loop.phases)
 
 
-def test_the_sphere_is_thrown_in_its_way_and_it_flows_around_it(whole):
-    whole.run(1.5)
-    before, ahead = whole.arm.q, whole.arm.ahead
-    near = ahead[np.linalg.norm(ahead - whole.hand, axis=1) > 0.2][0]
-    whole.show(changed(whole.scenario, obstacles=(sphere_at(near),)))
-    np.testing.assert_array_equal(whole.arm.q, before)
-    begun = len(whole.passed)
-    whole.assert_arrives_without_a_jump()
-    whole.assert_free(since=begun)
-
-
 def test_another_task_does_not_move_it_at_once(begin, initial):
     loop = begin(changed(initial("push_box"), space="cspace")).run(1.0)
     loop.show(changed(initial("draw_s"), space="task"))
@@ -160,18 +149,6 @@ def test_pushed_aside_again_and_again_it_still_reaches_the_goal(whole):
     assert Phase.HELD in whole.phases
     whole.assert_free()
     assert whole.robot.end_effector(np.array(whole.passed))[:, 2].min() > 0
-
-
-def test_pushes_differ_and_are_the_same_every_time(begin, initial):
-    def pushed(times):
-        loop = begin(changed(initial("draw_s"), space="task")).run(2.0)
-        for _ in range(times):
-            loop.arm.push()
-            loop.run(0.4)
-        return loop.hand
-
-    np.testing.assert_array_equal(pushed(1), pushed(1))
-    assert np.linalg.norm(pushed(2) - pushed(1)) > 0.01
 
 
 class TestHolding:
@@ -278,15 +255,6 @@ def test_it_waits_for_its_first_motion(engine):
     arm.push()
     arm.advance(1.0, moves=True)
     assert arm.q is None and arm.undisturbed is None and len(arm.ahead) == 0 and arm.note == ""
-
-
-def test_it_is_put_elsewhere_and_goes_on_from_there(whole):
-    elsewhere = whole.run(1.0).arm.q + np.array([0.2, 0.1, -0.1, 0.0, 0.1, 0.0])
-    whole.arm.put(elsewhere)
-    whole.passed.clear()
-    whole.run(PICTURE)
-    assert np.abs(whole.arm.q - elsewhere).max() < 0.03
-    whole.assert_arrives_without_a_jump()
 
 
 @pytest.mark.parametrize("space", ["task", "cspace"])

@@ -31,7 +31,7 @@ def take(name="a", positions=None, times=None, joints=None, units=None, **option
     assert values is not None
     times = 0.01 * np.arange(len(values)) if times is None else times
     names = () if joints is None else tuple(f"joint{k + 1}" for k in range(joints.shape[1]))
-    return Take(name, times, positions, None, joints, names, lambda row: f"at sample {row + 1}", units or {}, **options)
+    return Take(name, times, positions, None, joints, names, units or {}, **options)
 
 
 def motion(start=(-0.2, -0.4, 0.2), goal=GOAL, num=200, bend=0.1):

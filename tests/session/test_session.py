@@ -9,7 +9,7 @@ from typing import cast
 
 import numpy as np
 import pytest
-from scenes import avoiding, biases, changed, changing, starts_at
+from scenes import avoiding, biases, changed, changing
 
 from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.avoidance.passing import ANEW, Passing
@@ -212,15 +212,6 @@ class TestPassing:
         opened.settle()
         assert opened.shown.passing is ANEW is opened.session.scenario.passing
 
-    def test_a_beginning_of_the_same_motion_keeps_what_is_shown(self, opened):
-        opened.engine.task = lambda name: TASKS[name]()
-        opened.edit("drag", obstacles=at(0.1))
-        opened.settle()
-        own, there = opened.session.scenario, opened.shown.passing
-        opened.session.load("draw_s", lambda _: replace(own, view=View(grid=True), passing=None))
-        opened.settle()
-        assert opened.session.scenario.passing is opened.shown.passing is there
-
     def test_what_is_decided_reaches_a_scenario_whose_view_was_changed_meanwhile(self, opened):
         opened.engine.gate = threading.Event()
         opened.engine.begun.clear()
@@ -233,22 +224,6 @@ class TestPassing:
         opened.settle()
         assert opened.session.scenario.view.speed == 2.0
         assert opened.session.scenario.passing is opened.shown.passing is not None
-
-    def test_edits_that_are_overtaken_leave_the_decision_to_the_last_one(self, opened):
-        shown = opened.page.frames[-1].passing
-        opened.engine.gate = threading.Event()
-        opened.engine.begun.clear()
-        opened.edit("drag", obstacles=at(0.1))
-        assert opened.engine.begun.wait(PATIENCE)
-        for x in (0.2, 0.3):
-            opened.edit("drag", obstacles=at(x))
-        assert opened.session.scenario.passing is None
-        opened.engine.gate.set()
-        opened.settle()
-        last = opened.page.frames[-1].scenario
-        assert last.obstacles == (at(0.3),) and last.passing is not shown
-        drawn = [frame for frame in opened.page.frames if frame.scenario.obstacles == (at(0.1),)]
-        assert last.passing is drawn[-1].passing
 
 
 def at(x):
@@ -459,17 +434,6 @@ def test_what_is_shown_is_stale_while_another_task_is_expected_read_or_learned(o
 
 
 UNDRAWABLE = View(generator=True, generator_layer=-9, health_plots=True)
-
-
-def test_a_view_that_cannot_be_drawn_is_left_by_reset(opened, caplog):
-    with caplog.at_level(logging.CRITICAL):
-        opened.edit("view", view=UNDRAWABLE)
-        opened.settle()
-    assert opened.page.errors == ["IndexError: no such flow"]
-    opened.session.reset()
-    opened.settle()
-    assert opened.page.frames[-1] == Sketch(fresh("draw_s"), Stage.CERTIFIED)
-    assert opened.session.scenario == fresh("draw_s") and len(opened.page.errors) == 1
 
 
 @pytest.mark.parametrize("meanwhile", [False, True])
@@ -800,22 +764,3 @@ def test_the_arm_is_driven_by_the_first_frame_of_each_motion_and_by_the_refined_
     opened.edit("grid", view=View(grid=True))  # the same motion: it was there before
     opened.settle()
     assert [frame.stage for frame in driven[4:]] == [Stage.FINE]
-
-
-# --- Starts ---
-
-
-def test_starts_are_added_and_removed_step_by_step_for_undo_and_another_task_has_none(opened):
-    a, b = starts_at((0.1, -0.5, 0.4), (0.2, -0.5, 0.4))
-    for starts in ((a,), (a, b), (b,)):
-        opened.edit("starts", starts=starts)
-        opened.session.end_gesture()
-    for expected in ((a, b), (a,), ()):
-        opened.session.undo()
-        assert opened.session.scenario.starts == expected
-    opened.session.redo()
-    opened.session.redo()
-    opened.settle()
-    assert opened.shown.starts == (a, b)
-    opened.session.choose_task("lift_box")
-    assert opened.session.scenario.starts == ()

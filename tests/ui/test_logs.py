@@ -44,22 +44,14 @@ def test_an_exception_is_written_with_its_type_and_places_without_its_text(log):
     assert "secret" not in written.getvalue().replace('float("secret")', "")  # of the program it holds the line
 
 
-def test_few_records_of_a_kind_are_written_in_a_period(log, clock):
-    logger, written = log
-    for k in range(1000):
-        logger.warning("number %d", k)
-    assert written.getvalue().splitlines() == [f"number {k}" for k in range(MAX_RECORDS)]
-    clock.now += PERIOD
-    logger.warning("another kind")
-    assert written.getvalue().splitlines()[-1] == "another kind"
-
-
-def test_the_first_record_after_a_period_says_how_many_were_left_out(log, clock):
+def test_few_records_of_a_kind_are_written_in_a_period_and_how_many_were_left_out_in_the_next(log, clock):
     logger, written = log
     for k in range(MAX_RECORDS + 7):
         clock.now = PERIOD if k == MAX_RECORDS + 6 else 0.0
-        logger.warning("again")
-    assert written.getvalue().splitlines()[-1] == "again (and 6 more like this)"
+        logger.warning("number %d", k)
+    logger.warning("another kind")
+    last = f"number {MAX_RECORDS + 6} (and 6 more like this)"
+    assert written.getvalue().splitlines() == [*(f"number {k}" for k in range(MAX_RECORDS)), last, "another kind"]
 
 
 def test_the_same_line_with_another_exception_is_another_kind(log):

@@ -2,7 +2,7 @@
 
 import pytest
 
-from dt_viz.ui.origins import Origin, OriginError, Origins
+from dt_viz.ui.origins import Origin, OriginError, Origins, address_of
 
 LOCAL = Origins("127.0.0.1")
 EVERYWHERE = Origins("0.0.0.0", [Origin.parse("https://demo.example.org")])
@@ -81,3 +81,17 @@ def test_an_origin_is_a_scheme_a_host_and_maybe_a_port():
 def test_what_is_no_origin_is_refused_with_what_would_be_accepted(text):
     with pytest.raises(OriginError, match=r"found .*accepted: http:// or https://"):
         Origin.parse(text)
+
+
+@pytest.mark.parametrize(
+    ("peer", "forwarded", "counted"),
+    [
+        ("127.0.0.1", [], ""),
+        ("::1", ["nonsense"], ""),
+        ("127.0.0.1", ["1.1.1.1, 203.0.113.7"], "203.0.113.7/32"),
+        ("203.0.113.7", ["1.1.1.1"], "203.0.113.7/32"),  # it may say what it likes
+        ("2001:db8::7", [], "2001:db8::/64"),
+    ],
+)
+def test_a_request_is_counted_for_who_has_sent_it(peer, forwarded, counted):
+    assert address_of(peer, forwarded) == counted

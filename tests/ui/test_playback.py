@@ -168,11 +168,6 @@ class TestReplay:
         player.playback.replay.motion = ramp(5.0, 6.0, 0.5)
         assert player.play(PICTURE)[-1] == pytest.approx(5.44)
 
-    def test_a_pause_stops_it(self, player):
-        held = player.play(0.2)[-1]
-        player.playback.play(False, 1.0, replays=True)
-        assert set(player.play(0.2)) == {held}
-
     def test_the_time_at_the_goal_is_counted_from_arrival_to_the_next_round(self, player):
         rests = []
         for _ in range(200):

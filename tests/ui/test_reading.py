@@ -22,7 +22,7 @@ class Visitor:
 
     def read(self) -> None:
         try:
-            with turn(self.waits.set, partial(self.jobs.superseded, LANE)):
+            with turn(lambda *_said: self.waits.set(), partial(self.jobs.superseded, LANE)):
                 self.reads.set()
                 assert self.let_go.wait(PATIENCE)
             self.end = "read"

@@ -1,17 +1,9 @@
 """The foot of the panel, without a browser."""
 
-import html
 import re
 
 from dt_viz.ui.scene import palette
-from dt_viz.ui.tabs.about import AUTHORS, LEGEND, LINK, TITLE, Command, keys_html, legend_html, numbered, paper_html
-
-
-def test_the_paper_is_named_with_all_authors_and_a_link_that_opens_beside_the_page():
-    said = html.unescape(paper_html())
-    assert TITLE in said and AUTHORS.count(",") == 3 and AUTHORS in said and "2022" in said
-    (link,) = re.findall(r"<a href='([^']*)' target='_blank' rel='noopener", said)
-    assert link == LINK and link.startswith("https://")
+from dt_viz.ui.tabs.about import LEGEND, Command, keys_html, legend_html, numbered
 
 
 def test_the_legend_has_each_colour_that_is_drawn_once():

@@ -13,33 +13,25 @@ DROP, PUSH, DRAW = (TASKS[name]() for name in ("drop_pots", "push_box", "draw_s"
 LEFT, RIGHT = (np.array([POTS[k].x, POTS[k].y, 0.25]) for k in (0, 2))
 
 
-class Carrying:
-    """What is carried, and the hand that carries it."""
-
-    def __init__(self, scene):
-        self._carried = Carried(scene, "/hand", ROBOT.end_effector_offset, ROBOT.hand_axis)
-        self.objects, self.drawing = self._carried.objects, self._carried.drawing
-        self.stand, self.show = self._carried.stand, self._carried.show
-
-    def pose(self, hand, arrived, moment=0.0):
-        return self._carried.pose(moment, hand, arrived, LIGHT)
-
-
 @pytest.fixture
 def carrying(scene):
-    return Carrying(scene)
+    return Carried(scene, "/hand", ROBOT.end_effector_offset, ROBOT.hand_axis)
+
+
+def pose(carrying, hand, arrived, moment=0.0):
+    return carrying.pose(moment, hand, arrived, LIGHT)
 
 
 def test_pots_are_drawn_for_tasks_that_have_some(carrying):
     carrying.stand(DRAW)
-    assert carrying.objects.pots == ()
+    assert carrying.pots == ()
     carrying.stand(DROP)
-    assert [tuple(handle.position) for handle in carrying.objects.pots] == [(pot.x, pot.y, 0.0) for pot in POTS]
-    before = carrying.objects.pots
+    assert [tuple(handle.position) for handle in carrying.pots] == [(pot.x, pot.y, 0.0) for pot in POTS]
+    before = carrying.pots
     carrying.stand(DROP)
-    assert carrying.objects.pots is before
+    assert carrying.pots is before
     carrying.stand(DRAW)
-    assert carrying.objects.pots == ()
+    assert carrying.pots == ()
 
 
 def test_pots_are_open_above():
@@ -52,9 +44,9 @@ def test_pots_are_open_above():
 
 def test_the_ball_is_shown_with_the_arm_once_the_hand_is_known(carrying):
     carrying.stand(DROP)
-    ((_, ball),) = carrying.objects.items
+    ((_, ball),) = carrying.items
     assert not ball.visible
-    carrying.pose(LEFT, 0.0)
+    pose(carrying, LEFT, 0.0)
     assert ball.visible
     np.testing.assert_allclose(ball.position, LEFT)
     for shown in (False, True):
@@ -64,41 +56,40 @@ def test_the_ball_is_shown_with_the_arm_once_the_hand_is_known(carrying):
 
 def test_the_ball_stays_where_it_was_dropped_until_the_hand_sets_out_again(carrying):
     carrying.stand(DROP)
-    ((thing, ball),) = carrying.objects.items
-    carrying.pose(LEFT, 0.0)
+    ((thing, ball),) = carrying.items
+    pose(carrying, LEFT, 0.0)
     for hand, seconds in ((LEFT, 0.5), (RIGHT, 3.0)):  # the hand goes home
-        carrying.pose(hand, seconds)
+        pose(carrying, hand, seconds)
         np.testing.assert_allclose(ball.position, thing.fallen(LEFT, seconds))
-    carrying.pose(RIGHT, 0.0)
+    pose(carrying, RIGHT, 0.0)
     np.testing.assert_allclose(ball.position, RIGHT)
 
 
 def test_a_pushed_box_stays_at_the_goal_until_the_hand_sets_out_again(carrying):
     carrying.stand(PUSH)
-    ((box, handle),) = carrying.objects.items
+    ((box, handle),) = carrying.items
     np.testing.assert_array_equal(handle.position, box.start)
     path = PUSH.paths[0]
     for hand in path:
-        carrying.pose(hand, 0.0)
+        pose(carrying, hand, 0.0)
     pushed = np.array(handle.position)
     assert np.linalg.norm(pushed - box.start) > 0.3
     for hand in path[::-1]:
-        carrying.pose(hand, 1.0)
+        pose(carrying, hand, 1.0)
     np.testing.assert_array_equal(handle.position, pushed)
-    carrying.pose(path[0], 0.0)
+    pose(carrying, path[0], 0.0)
     np.testing.assert_array_equal(handle.position, box.start)
 
 
 class TestDrawing:
     @pytest.fixture
-    def carrying(self, scene):
-        carrying = Carrying(scene)
+    def carrying(self, carrying):
         carrying.stand(DRAW)
         return carrying
 
     def drawn(self, carrying, path, arrived=0.0, begin=0.0):
         for k, hand in enumerate(path):
-            carrying.pose(hand, arrived, begin + INK_PERIOD * 1.01 * k)
+            pose(carrying, hand, arrived, begin + INK_PERIOD * 1.01 * k)
         return carrying.drawing.ink.node.points
 
     def test_the_pen_leaves_ink_where_it_touches_the_board_only(self, carrying):
@@ -115,7 +106,7 @@ class TestDrawing:
         path = DRAW.paths[0]
         whole = len(self.drawn(carrying, path))
         assert len(self.drawn(carrying, path[::-1], arrived=1.0, begin=100.0)) == whole  # on the way home
-        carrying.pose(path[0], 0.0, 300.0)
+        pose(carrying, path[0], 0.0, 300.0)
         assert len(carrying.drawing.ink.node.points) == 0
 
     def test_it_is_shown_with_the_arm_in_tasks_that_draw(self, carrying):

@@ -20,8 +20,8 @@ from dt_viz.pictures.occupancy import occupancy_picture
 from dt_viz.pictures.sketchbook import Pictures
 from dt_viz.scenario.scenario import MAX_OBSTACLES, View
 from dt_viz.scenario.tasks import TASKS
+from dt_viz.ui.scene.draggables import Obstacles, shaded
 from dt_viz.ui.scene.markers import in_slice
-from dt_viz.ui.scene.obstacles import Obstacles, shaded
 from dt_viz.ui.scene.picture import Look
 from dt_viz.ui.scene.slice_layers import OccupancySlice
 from dt_viz.ui.tabs.world import SHAPES, add, add_obstacles, delete, duplicate, name_of, with_room
@@ -294,7 +294,6 @@ def test_the_map_is_painted_on_the_slice_the_right_way_up(server):
     made = occupancy_picture(task.slice, (ball,), coarse=True)
     picture.draw(frame_of(scenario(ball), pictures=Pictures(occupancy=made)), Look())
     image = picture.image.handle
-    assert image is not None
     painted = painted_at(image, task.slice.half_size, image.image[..., 3] > 190)
     np.testing.assert_allclose(painted, ball.position, atol=0.004)
     np.testing.assert_allclose(picture.level.node.points, made.level, atol=1e-6)

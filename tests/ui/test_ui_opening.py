@@ -11,14 +11,11 @@ import viser  # noqa: TID251 - forges what a browser sends
 from pages import PATIENCE, Page, frame_of, wait_until
 
 from dt_viz.files import uploads
-from dt_viz.learning.inspection import PreparationSettings
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.progress import Progress
 from dt_viz.session.session import CHOICES
-from dt_viz.ui.scene.palette import LIGHT
-from dt_viz.ui.tabs import opening
 from dt_viz.ui.tabs.from_file import LANE
-from dt_viz.ui.tabs.opening import CHOOSING, SEEING, SWITCHES
+from dt_viz.ui.tabs.opening import CHOOSING, SEEING
 
 RNG = np.random.default_rng(2)
 GOAL = np.array([0.2, -0.45, 0.3])
@@ -285,9 +282,3 @@ def test_two_visitors_open_at_the_same_instant_and_each_sees_its_own(robot, open
     finally:
         other.close()
         beside.stop()
-
-
-def test_every_kind_of_finding_that_can_be_switched_has_a_field():
-    fields = PreparationSettings.__dataclass_fields__
-    assert all(name in fields and fields[name].default is True for name, *_ in SWITCHES.values())
-    assert len(LIGHT.takes) > 5 and opening.FORMATS.endswith("zip")

@@ -18,13 +18,12 @@ from dt_viz.scenario.slices import SlicePose
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.frame import Stage
 from dt_viz.ui.scene.colour_scale import NUM_SHADES, from_oklab, oklab, ramp
+from dt_viz.ui.scene.draggables import MovableSlice, Obstacles
 from dt_viz.ui.scene.export import as_png
 from dt_viz.ui.scene.legend import OCCUPANCY, legend_of
-from dt_viz.ui.scene.obstacles import Obstacles
 from dt_viz.ui.scene.palette import LIGHT, css
 from dt_viz.ui.scene.picture import Look
 from dt_viz.ui.scene.rollouts import Rollouts
-from dt_viz.ui.scene.slice import MovableSlice
 from dt_viz.ui.scene.slice_layers import (
     OPACITY,
     VOLUME,
@@ -36,7 +35,7 @@ from dt_viz.ui.scene.slice_layers import (
     scale_of,
 )
 from dt_viz.ui.scene.tubes import NUM_SIDES, RolloutTubes
-from dt_viz.ui.tabs.show import WHOLE_ARM_NOTE, SlicePanel
+from dt_viz.ui.tabs.show import WHOLE_ARM_NOTE, ShowTab
 
 SCENARIO = avoiding("draw_s", (Sphere((0.0, -0.5, 0.4)),))
 POSE = SlicePose((0.1, -0.4, 0.5), (0.6, 0.8, 0.0, 0.0))
@@ -157,7 +156,6 @@ def test_the_image_follows_the_slice(scene):
         area = TASK.slice.posed(pose)
         shown.draw(frame(pictures=Pictures(colour=replace(picture_of(corner), area=area))), Look())
         handle = shown.image.handle
-        assert handle is not None
         dark = (np.abs(on_white(handle.image) - LIGHT.volume[-1]) < 2).all(axis=-1)
         place = painted_at(handle, area.half_size, dark)
         assert (area.across(place) > 0.8 * np.array(area.half_size)).all()
@@ -252,7 +250,7 @@ def test_a_saved_picture_is_white_behind_or_transparent():
 @pytest.fixture
 def opened(server):
     bound = Bound(SCENARIO)
-    yield SlicePanel(server.gui, bound), bound
+    yield ShowTab(server.gui, bound), bound
     server.gui.reset()
 
 

@@ -17,7 +17,7 @@ from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.stack import IMITATION, WHOLE_ARM, anchored, avoiding_with, selected
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui.panel import add_avoid_and_imitate, avoids_with
-from dt_viz.ui.scene.bias_points import BiasPoints
+from dt_viz.ui.scene.draggables import BiasPoints
 from dt_viz.ui.scene.picture import Look
 from dt_viz.ui.scene.rollouts import LevelRollouts
 from dt_viz.ui.scene.tubes import NUM_SIDES
@@ -30,7 +30,6 @@ from dt_viz.ui.tabs.stack import (
     SHOWN,
     UP,
     StackPanel,
-    durations,
     formula_html,
     legend_html,
     press,
@@ -53,8 +52,8 @@ def frame(scenario=SCENARIO, **changes):
         "task": TASKS[scenario.task](),
         "goal": np.zeros(3),
         "levels": tuple((np.full((5, 3), float(k)),) for k in range(4)),
-        "durations": (0.8, None, 0.4),
-        "chosen_values": ({"strength": 0.8, "radius": 0.2}, {}, {"duration": 0.4}),
+        "durations": {"Bias 1": 0.8, AVOIDANCE: 0.4},
+        "chosen_values": {"Bias 1": {"strength": 0.8, "radius": 0.2}, AVOIDANCE: {"duration": 0.4}},
     }
     return frame_of(scenario, **(given | changes))
 
@@ -63,7 +62,7 @@ def frame(scenario=SCENARIO, **changes):
 
 
 def listed(scenario):
-    return {row.name: row for row in rows(scenario, durations(frame(scenario)))}
+    return {row.name: row for row in rows(scenario, frame(scenario).durations)}
 
 
 def test_the_outermost_transform_is_on_top_and_the_base_at_the_bottom():

@@ -19,15 +19,32 @@ from dt_viz.obstacles.shapes import Sphere
 from dt_viz.robot.collision import NOTHING, CollisionReport, Nearest
 from dt_viz.scenario.paper_scenes import SCENES
 from dt_viz.scenario.scenario import Scenario, View
-from dt_viz.scenario.stack import avoiding_with
+from dt_viz.scenario.stack import WHOLE_ARM, avoiding_with
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.jobs import Jobs
 from dt_viz.session.progress import Message, Pace, Progress
 from dt_viz.session.session import Session
-from dt_viz.ui.tabs.status import BUTTON, CHANGED, HINT, LEADING, PALE, REASON, details_html, hint
-from dt_viz.ui.tabs.verdict import COMPUTING, FAILED, HOLDS, WARP_HINT, Verdict, concerns, remedy, verdict
+from dt_viz.ui.tabs.status import (
+    BUTTON,
+    CHANGED,
+    COMPUTING,
+    FAILED,
+    HINT,
+    HOLDS,
+    LEADING,
+    PALE,
+    REASON,
+    WARP_HINT,
+    Verdict,
+    concerns,
+    details_html,
+    hint,
+    hint_html,
+    remedy,
+    verdict,
+)
 from dt_viz.warning import ARM, Concern, Kind, MotionWarning, Severity
 
 PACE = Pace(0.02, 10.0, 0)
@@ -215,22 +232,22 @@ def test_the_details_say_what_the_arm_comes_near_to(collision, texts):
 
 
 @pytest.mark.parametrize(
-    ("layers", "durations", "arm", "said", "unsaid"),
+    ("layers", "durations", "said", "unsaid"),
     [
-        ((), (0.85,), None, (">0.85<",), ()),
-        ((), (None,), 0.5, (">0.50<",), ()),
-        ((), (None,), None, (">off<",), ()),
-        (BIASES, (0.8, None, None), None, (">0.80 Bias 1<", ">Strength<"), ("Flow time t", ">off<")),
-        (BIASES, (0.8, None, 0.4), None, (">0.80 Bias 1<", ">Strength<", "Flow time t"), (">off<",)),
+        ((), {"Avoidance": 0.85}, (">0.85<",), ()),
+        ((), {WHOLE_ARM: 0.5}, (">0.50<",), ()),
+        ((), {}, (">off<",), ()),
+        (BIASES, {"Bias 1": 0.8}, (">0.80 Bias 1<", ">Strength<"), ("Flow time t", ">off<")),
+        (BIASES, {"Bias 1": 0.8, "Avoidance": 0.4}, (">0.80 Bias 1<", ">Strength<", "Flow time t"), (">off<",)),
     ],
 )
-def test_the_details_say_which_flow_runs_how_long_or_how_strong(layers, durations, arm, said, unsaid):
-    details = details_of(frame(changed(HAND, layers=layers), durations=durations, arm_duration=arm))
+def test_the_details_say_which_flow_runs_how_long_or_how_strong(layers, durations, said, unsaid):
+    details = details_of(frame(changed(HAND, layers=layers), durations=durations))
     assert [text for text in (*said, *unsaid) if text in details] == list(said)
 
 
 def test_no_value_of_the_details_runs_out_of_the_panel_and_each_row_explains_itself():
-    told = frame(changed(HAND, layers=BIASES[:1]), certificates=HOLDING, durations=(0.8, 0.4))
+    told = frame(changed(HAND, layers=BIASES[:1]), certificates=HOLDING, durations={"Bias 1": 0.8, "Avoidance": 0.4})
     said = details_html(told, PACE, View())
     styles = re.findall(r"<td style='([^']*)'>", said)
     assert all("nowrap" in style for style in styles[::2]) and not any("nowrap" in style for style in styles[1::2])
@@ -358,14 +375,13 @@ def test_nothing_moves_when_a_message_comes_or_something_is_learned(panel):
         assert (panel.status.mend.visible, panel.status.cancel.visible) == (mends, cancels)
 
 
-def test_hints_take_the_same_room_and_are_told_in_full(panel):
+def test_hints_take_the_same_room_and_are_told_in_full():
     """A line of the panel holds about 44 characters."""
     texts = [scene.line for scene in SCENES.values()] + [entry().hint for entry in TASKS.values()] + [CHANGED, ""]
     rooms = set()
     for text in texts:
-        panel.give_hint(text)
-        rooms |= set(re.findall(r"<div style='height:([\d.]+)em", panel.hint.content))
-        assert text in html.unescape(panel.hint.content)
+        rooms |= set(re.findall(r"<div style='height:([\d.]+)em", hint_html(text)))
+        assert text in html.unescape(hint_html(text))
         assert len(textwrap.wrap(text, 44)) * LEADING <= HINT
     assert rooms == {f"{HINT:.3f}"}
 

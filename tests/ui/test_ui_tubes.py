@@ -14,8 +14,8 @@ from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui.scene.palette import LIGHT
 from dt_viz.ui.scene.picture import Look
-from dt_viz.ui.scene.rollouts import Demonstrations, Ghost
-from dt_viz.ui.scene.style import TubeStyle
+from dt_viz.ui.scene.rollouts import demonstrations, ghost
+from dt_viz.ui.scene.style import Style
 from dt_viz.ui.scene.tubes import INSIDE, NUM_RINGS, NUM_SIDES, RolloutTubes, Tubes, evenly_bent, tube_faces, tubes
 
 RADIUS, BALL = 0.003, 0.007
@@ -70,7 +70,7 @@ def test_points_are_denser_where_a_path_bends():
 
 
 def test_faces_are_sent_only_when_the_number_of_paths_changes(scene):
-    shown = Tubes(scene, "/tubes", TubeStyle("rollout", RADIUS))
+    shown = Tubes(scene, "/tubes", Style("rollout", radius=RADIUS))
     shown.show(PATHS, LIGHT)
     faces = shown.node.faces
     shown.show(PATHS + 0.1, LIGHT)
@@ -86,16 +86,16 @@ def frame(*rollouts, **changes):
 
 def test_lines_are_drawn_only_beside_the_rollouts(scene):
     task = TASKS["draw_s"]()
-    demonstrations, ghost = Demonstrations(scene), Ghost(scene)
+    thin, dashed = demonstrations(scene), ghost(scene)
     first = frame(*task.paths)
-    for picture in (demonstrations, ghost):
+    for picture in (thin, dashed):
         picture.draw(first, Look(tubes=RolloutTubes(first.rollouts)))
-    assert len(demonstrations.node.points) == len(ghost.node.points) == 0
+    assert len(thin.node.points) == len(dashed.node.points) == 0
     aside = tuple(path + np.array([0.0, 0.02, 0.0]) for path in task.paths)
     half = replace(first, rollouts=(*aside[:3], *task.paths[3:]))
-    demonstrations.draw(half, Look(tubes=RolloutTubes(half.rollouts)))
-    middles = demonstrations.node.points.mean(axis=1)
+    thin.draw(half, Look(tubes=RolloutTubes(half.rollouts)))
+    middles = thin.node.points.mean(axis=1)
     samples = np.concatenate([evenly_bent(path) for path in half.rollouts])
     assert len(middles) > 100 and KDTree(samples).query(middles)[0].min() > 0.99 * INSIDE
-    ghost.draw(first, Look(tubes=RolloutTubes(first.rollouts, shown=False)))
-    assert len(ghost.node.points) > 10  # nothing covers it any more
+    dashed.draw(first, Look(tubes=RolloutTubes(first.rollouts, shown=False)))
+    assert len(dashed.node.points) > 10  # nothing covers it any more

@@ -11,19 +11,18 @@ def upload():
     return Upload(1000)
 
 
-def test_a_file_arrives_in_parts_in_any_order(upload):
+def test_a_file_arrives_in_parts_in_any_order_and_nothing_else_is_wanted(upload):
+    assert not upload.part("a", 0, 1)
     upload.start("a", "x.ply", 1000, 3)
     assert [upload.part("a", index, size) for index, size in ((2, 200), (0, 400), (1, 400))] == [True] * 3
     assert not upload.part("a", 1, 400)  # it is complete
+    upload.start("a", "x.ply", 0, 0)
+    assert not upload.part("a", 0, 0)
 
 
 def test_a_file_that_is_announced_too_large_is_refused_and_nothing_of_it_is_wanted(upload):
     with pytest.raises(DataError, match=r"x\.ply: file: found 0\.0 MB; accepted: at most 0 MB"):
         upload.start("a", "x.ply", 1001, 1)
-    assert not upload.part("a", 0, 1)
-
-
-def test_parts_of_a_file_that_was_never_announced_are_not_wanted(upload):
     assert not upload.part("a", 0, 1)
 
 
@@ -52,8 +51,3 @@ def test_parts_that_do_not_add_up_to_what_was_announced_come_from_no_page(upload
 def test_numbers_of_parts_that_no_file_has_come_from_no_page(num_bytes, num_parts):
     with pytest.raises(MalformedError):
         Upload(10**6).start("a", "x.ply", num_bytes, num_parts)
-
-
-def test_an_empty_file_has_no_parts(upload):
-    upload.start("a", "x.ply", 0, 0)
-    assert not upload.part("a", 0, 0)

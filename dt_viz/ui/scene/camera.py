@@ -17,7 +17,6 @@ from dt_viz.scenario.panels import TITLE_ROOM, directions
 from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.tasks import Task
 from dt_viz.ui import gestures
-from dt_viz.ui.ruler import STEP
 
 HOME, HAND = "Home", "Hand"
 """Names of the views from the task's own direction: of all of it, and of the hand, from near."""
@@ -85,13 +84,13 @@ def window_size(camera: Any, width: float | None = None) -> tuple[int, int]:  # 
 
     Args:
         camera: viser's.
-        width: smallest width that the window can have, as of a `Ruler`; None if that is not known.
+        width: the window's width, as of a `Ruler`; None if that is not known.
     """
     size = gestures.vector((camera.image_width, camera.image_height), 2, 20_000)
     if size is None or size.min() < 100:  # no window has it
         return Framing.size
-    if width is not None and not width <= size[0] < STEP * width:
-        size *= width * STEP**0.5 / size[0]
+    if width is not None:
+        size *= width / size[0]
     return round(size[0]), round(size[1])
 
 
@@ -244,7 +243,7 @@ class CameraController:
             self._frame()
 
     def measured(self, width: float) -> None:
-        """Take the smallest width that the window can have, CSS pixels; that may fit the view."""
+        """Take the width of the window, CSS pixels; that may fit the view."""
         with self._lock:
             self._width = width
             self._fit()

@@ -15,65 +15,6 @@ from dt_viz.ui.scene.palette import LIGHT, Theme
 from dt_viz.ui.scene.picture import Lines
 from dt_viz.ui.scene.style import STYLES
 
-
-class Objects:
-    """The pots of a task, and its objects; these are shown with the arm only."""
-
-    def __init__(self, scene: viser.SceneApi) -> None:
-        self._scene = scene
-        self._arm, self._posed = True, False
-        self.pots: tuple[viser.MeshHandle, ...] = ()
-        self.items: tuple[tuple[TaskObject, viser.MeshHandle], ...] = ()
-        """What the hand moves, and its picture."""
-
-    def remove(self) -> None:
-        """Take all of them from the scene."""
-        for handle in (*self.pots, *(handle for _, handle in self.items)):
-            handle.remove()
-
-    def stand(self, task: Task) -> None:
-        """Show the objects of another task where they are at first."""
-        self.remove()
-        self._posed, add = False, self._scene.add_mesh_simple
-        self.pots = tuple(
-            add(f"/pots/{k}", *pot.surface(), color=LIGHT.pot, position=(pot.x, pot.y, 0.0), flat_shading=True)
-            for k, pot in enumerate(task.pots)
-        )
-        self.items = tuple(
-            (
-                each,
-                add(
-                    f"/objects/{k}",
-                    *each.surface(),
-                    position=np.zeros(3) if each.start is None else each.start,
-                    color=LIGHT.object,
-                    flat_shading=True,
-                    visible=self._arm and each.start is not None,
-                ),
-            )
-            for k, each in enumerate(task.objects)
-        )
-
-    def show(self, *, arm: bool) -> None:
-        """Show what the hand moves only with the arm, and what begins in the hand once that is known."""
-        self._arm = arm
-        for each, handle in self.items:
-            handle.visible = arm and (self._posed or each.start is not None)
-
-    def pose(self, hand: Hand, *, sets_out: bool) -> None:
-        """Let the hand go on; where it sets out from a start, all begins anew."""
-        for each, handle in self.items:
-            if sets_out:
-                handle.position = hand.place if each.start is None else each.start
-            place = np.asarray(handle.position)
-            moved = each.moved(place, hand)
-            if moved is not place:  # comparing, as an assignment does, takes longer than most pictures of an object
-                handle.position = moved
-        if not self._posed:
-            self._posed = True
-            self.show(arm=self._arm)
-
-
 TOUCHES = 0.006
 """Distance of the pen's tip from the board at which it leaves ink, metres."""
 INK_STEP = 0.004
@@ -115,24 +56,20 @@ class Drawing:
             f"{hand}/pen", tip + turn.apply(vertices), faces, color=LIGHT.ink, visible=False
         )
         self.ink = Lines(scene, "/ink", STYLES.ink)
-        self._arm = True
         self._area: Slice | None = None
         """Board of the task; None if that does not draw."""
         self._strokes: list[list[Array]] = []
         self._touched, self._drawn = False, -np.inf
-        self.show(arm=True)
 
     def stand(self, task: Task) -> None:
-        """Show the board of another task, empty."""
+        """Take the board of another task, empty."""
         self._area = task.slice if task.draws else None
         self._wipe()
         if self._area is not None:
             self.board.vertices = self._area.border[:4].astype(np.float32)
-        self.show(arm=self._arm)
 
     def show(self, *, arm: bool) -> None:
         """Show all only with the arm."""
-        self._arm = arm
         for node in (self.board, self._pen, self.ink.node):
             node.visible = arm and self._area is not None
 
@@ -159,31 +96,56 @@ class Drawing:
 
 
 class Carried:
-    """What the hand carries, and what it draws: all begins anew when the hand sets out from a start."""
+    """What the hand carries, and what it draws, shown with the arm only, and the pots of a task.
+
+    All begins anew when the hand sets out from a start.
+    """
 
     def __init__(self, scene: viser.SceneApi, node: str, tip: Array, axis: Array) -> None:
         """Begin with nothing; see `Drawing`."""
-        self.objects, self.drawing = Objects(scene), Drawing(scene, node, tip, axis)
+        self._scene, self.drawing = scene, Drawing(scene, node, tip, axis)
+        self._arm = True
         self._task: Task | None = None
         self._hand: Hand | None = None
         """Where the hand was last; None before it moves in this task."""
+        self.pots: tuple[viser.MeshHandle, ...] = ()
+        self.items: tuple[tuple[TaskObject, viser.MeshHandle], ...] = ()
+        """What the hand moves, and its picture."""
 
     def stand(self, task: Task) -> None:
         """Show the objects of a task where they are at first, unless they are shown."""
-        if task is not self._task:
-            self._task, self._hand = task, None
-            self.objects.stand(task)
-            self.drawing.stand(task)
+        if task is self._task:
+            return
+        self._clear()
+        self._task, self._hand, add = task, None, self._scene.add_mesh_simple
+        self.pots = tuple(
+            add(f"/pots/{k}", *pot.surface(), color=LIGHT.pot, position=(pot.x, pot.y, 0.0), flat_shading=True)
+            for k, pot in enumerate(task.pots)
+        )
+        self.items = tuple(
+            (each, add(f"/objects/{k}", *each.surface(), color=LIGHT.object, flat_shading=True))
+            for k, each in enumerate(task.objects)
+        )
+        for each, handle in self.items:
+            handle.position = np.zeros(3) if each.start is None else each.start
+        self.drawing.stand(task)
+        self.show(arm=self._arm)
+
+    def _clear(self) -> None:
+        for handle in (*self.pots, *(handle for _, handle in self.items)):
+            handle.remove()
 
     def remove(self) -> None:
         """Take all from the scene but what is in the hand."""
-        self.objects.remove()
+        self._clear()
         for node in (self.drawing.board, self.drawing.ink.node):
             node.remove()
 
     def show(self, *, arm: bool) -> None:
-        """Show all only with the arm."""
-        self.objects.show(arm=arm)
+        """Show all only with the arm, and what begins in the hand once that is known."""
+        self._arm = arm
+        for each, handle in self.items:
+            handle.visible = arm and (self._hand is not None or each.start is not None)
         self.drawing.show(arm=arm)
 
     def pose(self, now: float, place: Array, arrived: float, theme: Theme) -> bool:
@@ -195,10 +157,18 @@ class Carried:
             arrived: time since it came to the goal, seconds; 0 until it does.
             theme: colours.
         """
-        last = self._hand or Hand(place, place, place, arrived)
-        sets_out = self._hand is None or (arrived == 0 and last.arrived > 0)
+        begins, last = self._hand is None, self._hand or Hand(place, place, place, arrived)
+        sets_out = begins or (arrived == 0 and last.arrived > 0)
         goal = place if arrived == 0 or last.arrived == 0 else last.goal
-        self._hand = Hand(place, last.place, goal, arrived)
-        self.objects.pose(self._hand, sets_out=sets_out)
-        self.drawing.pose(now, self._hand, theme, sets_out=sets_out)
+        self._hand = hand = Hand(place, last.place, goal, arrived)
+        for each, handle in self.items:
+            if sets_out:
+                handle.position = hand.place if each.start is None else each.start
+            before = np.asarray(handle.position)
+            moved = each.moved(before, hand)
+            if moved is not before:  # comparing, as an assignment does, takes longer than most pictures of an object
+                handle.position = moved
+        if begins:
+            self.show(arm=self._arm)
+        self.drawing.pose(now, hand, theme, sets_out=sets_out)
         return sets_out

@@ -1,92 +1,19 @@
-"""The hand of the arm in the loop: the ball to hold it by, its path ahead, and, fading, where it came."""
+"""The path of the hand of the arm in the loop: ahead, and, fading, where it came."""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 
 import numpy as np
 import viser
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from dt_viz.flows.fields import Array
-from dt_viz.robot.robot import Robot
-from dt_viz.session.frame import Frame
-from dt_viz.ui.gestures import Drag
-from dt_viz.ui.scene.markers import Draggable, Marker
 from dt_viz.ui.scene.palette import Theme
-from dt_viz.ui.scene.picture import Lines, Look, Shown, add_ball, add_label, assign
+from dt_viz.ui.scene.picture import Lines, Shown, assign
 from dt_viz.ui.scene.style import STYLES
 from dt_viz.ui.scene.tubes import RolloutTubes
-
-
-class _HandMarker(Marker):
-    """A ball that the hand carries: it goes where the arm goes, not where it is dragged."""
-
-    def __init__(self, group: Grip, ball: viser.IcosphereHandle, where: Callable[[], Array | None]) -> None:
-        super().__init__(group, ball, ball)
-        self._where = where
-
-    def _stands(self, drag: Drag) -> Array:
-        hand = self._where()
-        return drag.grabbed if hand is None else hand
-
-    def stand(self, position: ArrayLike, wxyz: ArrayLike | None = None) -> None:
-        pass
-
-
-class Grip(Draggable[_HandMarker]):
-    """A ball that moves with the hand, and is dragged parallel to the slice."""
-
-    def __init__(
-        self,
-        scene: viser.SceneApi,
-        robot: Robot,
-        node: str,
-        where: Callable[[], Array | None],
-        held: Callable[[Array, str], None],
-    ) -> None:
-        """Attach the ball to the hand.
-
-        Args:
-            scene: scene of the visitor.
-            robot: the arm.
-            node: node of the hand.
-            where: returns the current place of the hand, (3,), metres; None before it moves.
-            held: called with the desired place of the hand, (3,), metres, and the phase of the drag.
-        """
-        offset = tuple(robot.end_effector_offset)
-        options = {"position": offset, "opacity": 0.85, "cast_shadow": False, "visible": False}
-        super().__init__(add_ball(scene, f"{node}/grip", STYLES.grip, **options))
-        self._note = add_label(scene, f"{node}/grip/note", anchor="bottom-left", visible=False)
-        self._said = ""
-        self._held = held
-        _HandMarker(self, self.node, where)
-
-    def draw(self, frame: Frame, look: Look) -> None:
-        """Remembers the slice for drags."""
-        self.area = frame.slice
-
-    def moved(self, marker: _HandMarker, position: Array, wxyz: Array, phase: str) -> None:
-        self._held(position, phase)
-
-    @contextmanager
-    def hidden(self) -> Iterator[None]:
-        """Hide the ball while a picture is made."""
-        shown, self.visible = self.visible, False
-        try:
-            yield
-        finally:
-            self.visible = shown
-
-    def say(self, warning: str) -> None:
-        """Show a warning beside the hand; none if it is empty."""
-        if warning != self._said:
-            self._said = warning
-            self._note.text = warning or self._note.text
-            self._note.visible = bool(warning)
-
 
 TRAIL_SECONDS = 2.5
 """Time after which the trail has faded, seconds."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from abc import abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -19,7 +19,7 @@ from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.slices import Slice
 from dt_viz.session.frame import Frame
 from dt_viz.session.session import Session
-from dt_viz.ui import gestures
+from dt_viz.ui import gestures, patches
 from dt_viz.ui.gestures import Drag
 from dt_viz.ui.scene.picture import Look, Picture
 
@@ -36,8 +36,8 @@ class Marker:
         node: Any,  # noqa: ANN401 - nodes of all kinds
         body: Any = None,  # noqa: ANN401
         *,
-        key: int | str = 0,
         scale: float = 0.0,
+        where: Callable[[], Array | None] | None = None,
     ) -> None:
         """Begin without handles.
 
@@ -45,11 +45,13 @@ class Marker:
             group: told of drags.
             node: node of the scene that stands where the thing does.
             body: what is dragged, the node or a child of it; None has handles only.
-            key: index or name of the thing in the scenario.
-            scale: approximate size of the handles, metres.
+            scale: approximate size of the handles, metres; 0 has none.
+            where: returns the place (3,), metres, of a thing that moves by itself, and not where it is dragged.
         """
-        self.node, self.body, self.key, self.scale = node, body, key, scale
-        self._group = group
+        self.node, self.body, self.scale = node, body, scale
+        self.key: int | str = 0
+        """Index or name of the thing in the scenario."""
+        self._group, self._where = group, where
         self._position, self._wxyz = np.array(node.position), np.array(node.wxyz)
         self._drag: tuple[Array, Array] | None = None
         """Point (3,) at which the current drag of the body has grabbed it, and its position (3,) then, metres."""
@@ -59,10 +61,10 @@ class Marker:
         """Whether it has handles, also while they are hidden for a picture."""
         self._refused = False
         """Whether the current drag of a handle has left the permitted space."""
-        if isinstance(node, viser.TransformControlsHandle):
+        if scale:
             handled: Any = self._handled  # viser takes coroutines, too, against its type hints
             node.on_update(handled)
-            self._show(False)
+            self.hide_handles(True)
         if body is not None:
             gestures.on_drag(body, self._dragged)
 
@@ -87,39 +89,28 @@ class Marker:
     @has_handles.setter
     def has_handles(self, wanted: bool) -> None:
         self._wanted = wanted
-        self._show(wanted)
+        self.hide_handles(False)
 
     def hide_handles(self, hidden: bool) -> None:
         """Hide the handles while a picture is made, or show them again."""
-        if self.scale:
-            self._show(self._wanted and not hidden)
-
-    def _show(self, shown: bool) -> None:
-        # hiding the node would hide its children, too
-        self.node.scale, self.node.opacity = (self.scale, 1.0) if shown else (1e-6, 0.0)
+        if self.scale:  # hiding the node would hide its children, too
+            shown = self._wanted and not hidden
+            self.node.scale, self.node.opacity = (self.scale, 1.0) if shown else (1e-6, 0.0)
 
     async def _handled(self, event: viser.TransformControlsEvent) -> None:
         """Take a pose that the user gives it by the handles, if they are shown; else put it back."""
         position, wxyz = gestures.place(self.node.position), gestures.turn(self.node.wxyz)
         can_move = self._wanted and self.node.visible and event.phase in gestures.PHASES
-        if position is None or wxyz is None or not can_move:
-            self._refused = True
+        taken = position is not None and wxyz is not None and can_move
+        if not taken or (self._refused and event.phase == "end"):  # during the drag the browser ignores poses
             self._put_back()
-            return
-        if self._refused and event.phase == "end":  # during the drag the browser ignores poses
-            self._put_back()
-        self._refused = self._refused and event.phase == "update"
-        self._position, self._wxyz = position, wxyz
-        self._group.moved(self, position.copy(), wxyz.copy(), event.phase)
+        self._refused = not taken or (self._refused and event.phase == "update")
+        if position is not None and wxyz is not None and can_move:
+            self._position, self._wxyz = position, wxyz
+            self._group.moved(self, position.copy(), wxyz.copy(), event.phase)
 
     def _put_back(self) -> None:
-        # viser stores whatever was sent, and skips values that it has already
-        self.node._impl.position, self.node._impl.wxyz = np.full(3, np.nan), np.full(4, np.nan)
-        self.node.position, self.node.wxyz = self._position, self._wxyz
-
-    def _stands(self, drag: Drag) -> Array:
-        """Return where the thing stands when a drag begins, (3,), metres."""
-        return self.position
+        patches.put_back_pose(self.node, self._position, self._wxyz)
 
     def _dragged(self, drag: Drag) -> None:
         """Move parallel to the slice.
@@ -130,14 +121,16 @@ class Marker:
         if drag.phase == "start":
             self._group.grabbed(self)
         if drag.phase == "start" or self._drag is None:
-            self._asked = self._stands(drag)
+            stands = self.position if self._where is None else self._where()
+            self._asked = drag.grabbed if stands is None else stands
             self._drag = drag.grabbed, self._asked
         grabbed, stood = self._drag
         place = gestures.place(stood + in_slice(self._group.area, drag.camera, grabbed, drag.pointer))
         self._asked = self._asked if place is None else place
         if drag.phase == "end":
             self._drag = None
-        self.stand(self._asked)
+        if self._where is None:
+            self.stand(self._asked)
         self._group.moved(self, self._asked.copy(), self._wxyz.copy(), drag.phase)
 
 
@@ -161,9 +154,11 @@ class Draggable(Picture, Generic[M]):
 class MarkerGroup(Draggable[M]):
     """Markers of all things of one kind, in the order of the scenario."""
 
-    chosen: ClassVar[str]
-    """Field of the view that names the thing with handles."""
-    handles: ClassVar[str]
+    gesture: ClassVar[str]
+    """Name of the edits that move one, for undo; its key is filled in."""
+    chosen: ClassVar[str] = ""
+    """Field of the view that names the thing with handles; empty where none can be chosen."""
+    handles: ClassVar[str] = ""
     """Field of the view that says whether it has handles."""
 
     def __init__(self, scene: viser.SceneApi, node: Any, session: Callable[[], Session]) -> None:  # noqa: ANN401
@@ -174,73 +169,87 @@ class MarkerGroup(Draggable[M]):
         self._changing = threading.Lock()  # one thread draws, another makes and removes markers
 
     @abstractmethod
-    def adopt(self, scenario: Scenario) -> None:
-        """Show the scenario's things where they stand."""
+    def _things(self, scenario: Scenario) -> Mapping[Any, Any]:
+        """The things of a scenario, by index or name."""
 
     @abstractmethod
     def _new(self, index: int) -> M:
         """Make the marker of this index."""
 
     @abstractmethod
-    def _move(self, session: Session, marker: M, position: Array, wxyz: Array) -> None:
-        """Give a thing, if it is still there, a new pose, (3,), metres, and (4,)."""
+    def _show(self, marker: M, thing: Any, scenario: Scenario) -> None:  # noqa: ANN401 - things of all kinds
+        """Show a thing where it stands."""
+
+    @abstractmethod
+    def _moved(self, scenario: Scenario, key: Any, position: Array, wxyz: Array) -> Mapping[str, Any]:  # noqa: ANN401
+        """Fields of the scenario that change when the thing of this key has a new pose, (3,), metres, and (4,)."""
 
     def _selected(self, scenario: Scenario) -> int | str | None:
         """Key of the thing that has handles if any has."""
 
-    def moved(self, marker: M, position: Array, wxyz: Array, phase: str) -> None:
-        """Take the edits of a drag together for undo."""
-        session = self._session()
-        if phase == "start":
-            session.begin_gesture()
-        self._move(session, marker, position, wxyz)
-        if phase == "end":
-            session.end_gesture()
-
-    def grabbed(self, marker: M) -> None:
-        session = self._session()
-        session.edit("select", view=replace(session.scenario.view, **{self.chosen: marker.key}))
-
-    def clicked(self, marker: M) -> None:
-        """Take a click on a marker: it gets handles, or loses them."""
-        session = self._session()
-        view, is_selected = session.scenario.view, marker.key == self._selected(session.scenario)
-        handles = not (getattr(view, self.handles) and is_selected)
-        session.edit("select", view=replace(view, **{self.chosen: marker.key, self.handles: handles}))
-
     def _handled(self, scenario: Scenario) -> int | str | None:
         """Key of the thing that has handles."""
-        view = scenario.view
-        return self._selected(scenario) if getattr(view, self.handles) and not view.move_slice else None
-
-    def _fit(self, num: int) -> None:
-        """Make or remove markers until there are so many."""
-        with self._changing:
-            while len(self.items) > num:
-                self.items.pop().node.remove()
-            while len(self.items) < num:
-                marker = self._new(len(self.items))
-                self.items.append(marker)
-                if marker.body is not None:
-                    gestures.on_click(marker.body, partial(self.clicked, marker))
+        shown = self.chosen and getattr(scenario.view, self.handles) and not scenario.view.move_slice
+        return self._selected(scenario) if shown else None
 
     def draw(self, frame: Frame, look: Look) -> None:
         """Remembers the slice for drags."""
         self.area = frame.task.slice
 
+    def adopt(self, scenario: Scenario) -> None:
+        """Show the scenario's things where they stand; a pose that the browser has already is not sent to it."""
+        things, handled = self._things(scenario), self._handled(scenario)
+        with self._changing:
+            while len(self.items) > len(things):
+                self.items.pop().node.remove()
+            while len(self.items) < len(things):
+                self.items.append(marker := self._new(len(self.items)))
+                if marker.body is not None:
+                    gestures.on_click(marker.body, partial(self.clicked, marker))
+        for marker, (key, thing) in zip(self.items, things.items(), strict=True):
+            marker.key = key
+            self._show(marker, thing, scenario)
+            marker.has_handles = key == handled
+
+    def moved(self, marker: M, position: Array, wxyz: Array, phase: str) -> None:
+        """Edit the scenario, if the thing is still there; the edits of a drag are one step for undo."""
+        session = self._session()
+        if phase == "start":
+            session.begin_gesture()
+        if marker.key in self._things(session.scenario):
+            changes = self._moved(session.scenario, marker.key, position, wxyz)
+            session.edit(self.gesture.format(marker.key), **changes)
+        if phase == "end":
+            session.end_gesture()
+
+    def grabbed(self, marker: M) -> None:
+        self._select(**{self.chosen: marker.key} if self.chosen else {})
+
+    def clicked(self, marker: M) -> None:
+        """Take a click on a marker: it gets handles, or loses them."""
+        scenario = self._session().scenario
+        has_handles = getattr(scenario.view, self.handles) and marker.key == self._selected(scenario)
+        self._select(**{self.chosen: marker.key, self.handles: not has_handles})
+
+    def _select(self, **view: Any) -> None:  # noqa: ANN401 - fields of the view
+        session = self._session()
+        if view:
+            session.edit("select", view=replace(session.scenario.view, **view))
+
     @contextmanager
     def without_handles(self) -> Iterator[None]:
         """Hide the handles, not what they move, while a picture is made."""
-        self._hide_handles(True)
+
+        def hide(hidden: bool) -> None:
+            with self._changing:
+                for marker in self.items:
+                    marker.hide_handles(hidden)
+
+        hide(True)
         try:
             yield
         finally:
-            self._hide_handles(False)
-
-    def _hide_handles(self, hidden: bool) -> None:
-        with self._changing:
-            for marker in self.items:
-                marker.hide_handles(hidden)
+            hide(False)
 
 
 def in_slice(area: Slice | None, camera: Array, grabbed: Array, pointer: Array) -> Array:

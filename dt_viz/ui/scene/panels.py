@@ -46,7 +46,7 @@ class PanelNodes:
         self.frame.position = panel.offset
         for field, lines in self.lines.items():
             if is_new(field):
-                show = lines.show_segments if field == "outlines" else lines.show
+                show = lines.show_segments if field in {"grid", "outlines"} else lines.show
                 show(getattr(panel, field), theme)
         if is_new("rollouts"):
             self.rollouts.show(middles_of(panel.rollouts), theme)

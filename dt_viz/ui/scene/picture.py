@@ -16,7 +16,7 @@ from dt_viz.flows.fields import Array
 from dt_viz.session.engine import ArmMotion
 from dt_viz.session.frame import Frame
 from dt_viz.ui.scene.palette import LIGHT, Theme, linear
-from dt_viz.ui.scene.style import ArrowStyle, BallStyle, LineStyle
+from dt_viz.ui.scene.style import Style
 from dt_viz.ui.scene.tubes import RolloutTubes
 
 
@@ -102,7 +102,7 @@ class Picture(Shown, ABC):
 class Lines:
     """Polylines of one look, as one set of line segments."""
 
-    def __init__(self, scene: viser.SceneApi, name: str, style: LineStyle, number: int = 0) -> None:
+    def __init__(self, scene: viser.SceneApi, name: str, style: Style, number: int = 0) -> None:
         """Make an empty set.
 
         Args:
@@ -154,7 +154,7 @@ def assign(node: Any, points: Array, colours: NDArray[np.uint8]) -> None:  # noq
 class Arrows:
     """Vectors at points, the larger the longer and nearer to the strong colour."""
 
-    def __init__(self, scene: viser.SceneApi, name: str, style: ArrowStyle) -> None:
+    def __init__(self, scene: viser.SceneApi, name: str, style: Style) -> None:
         """Make an empty set of this name in the scene tree."""
         self._style = style
         self.node = scene.add_arrows(
@@ -190,6 +190,6 @@ def add_label(
     return scene.add_label(name, text, **(usual | options))
 
 
-def add_ball(scene: viser.SceneApi, name: str, style: BallStyle, **options: Any) -> viser.IcosphereHandle:  # noqa: ANN401
+def add_ball(scene: viser.SceneApi, name: str, style: Style, **options: Any) -> viser.IcosphereHandle:  # noqa: ANN401
     """Add the ball that marks a place, with viser's further options."""
     return scene.add_icosphere(name, radius=style.radius, color=style.on(LIGHT), **options)

@@ -14,7 +14,8 @@ from dt_viz.ui.playback import Playback
 from dt_viz.ui.scene.arm import Arms
 from dt_viz.ui.scene.carried import Carried
 from dt_viz.ui.scene.comparison import TheirArm
-from dt_viz.ui.scene.hand import Grip, HandPath
+from dt_viz.ui.scene.draggables import Grip
+from dt_viz.ui.scene.hand import HandPath
 from dt_viz.ui.scene.palette import LIGHT, Theme
 from dt_viz.ui.scene.picture import Look
 from dt_viz.ui.scene.tubes import RolloutTubes

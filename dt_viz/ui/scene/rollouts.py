@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import viser
@@ -23,45 +22,34 @@ HAND_AXIS = 0.045
 """Length of their axes, metres."""
 
 
-class _OutsideTubes(Picture):
+class OutsideTubes(Picture):
     """Lines where they are not inside the tube of a rollout; while a drag goes on they follow with the field."""
 
-    def __init__(self, lines: Lines) -> None:
+    def __init__(self, lines: Lines, paths: Callable[[Frame], Sequence[Array]]) -> None:
+        """Draw the paths (T_i, 3), metres, of each frame with these lines."""
         super().__init__(lines.node)
-        self._lines = lines
+        self._lines, self._paths = lines, paths
 
     def draw(self, frame: Frame, look: Look) -> None:
-        if (
-            self._is_new(frame.task, look.tubes.shown, self._lines.style.on(look.theme))
-            or frame.stage is not Stage.ROLLOUTS
-        ):
+        drawn = frame.task, look.tubes.shown, self._lines.style.on(look.theme)
+        if self._is_new(*drawn) or frame.stage is not Stage.ROLLOUTS:
             segments = self._lines.segments(self._paths(frame))
             self._lines.show_segments(look.tubes.outside(segments), look.theme)
 
-    @abstractmethod
-    def _paths(self, frame: Frame) -> Sequence[Array]:
-        """Return the paths (T_i, 3), metres."""
+
+def demonstrations(scene: viser.SceneApi) -> OutsideTubes:
+    """Return the picture of the demonstrations: thin lines."""
+    return OutsideTubes(Lines(scene, "/demonstrations", STYLES.demonstration), lambda frame: frame.task.paths)
 
 
-class Demonstrations(_OutsideTubes):
-    """The demonstrations, as thin lines."""
+def ghost(scene: viser.SceneApi) -> OutsideTubes:
+    """Return that of the undisturbed motion of the rollout that the arm follows, dashed; of all, if that is none."""
 
-    def __init__(self, scene: viser.SceneApi) -> None:
-        super().__init__(Lines(scene, "/demonstrations", STYLES.demonstration))
-
-    def _paths(self, frame: Frame) -> Sequence[Array]:
-        return frame.task.paths
-
-
-class Ghost(_OutsideTubes):
-    """The undisturbed motion of the rollout that the arm follows, dashed."""
-
-    def __init__(self, scene: viser.SceneApi) -> None:
-        super().__init__(Lines(scene, "/ghost", STYLES.ghost))
-
-    def _paths(self, frame: Frame) -> Sequence[Array]:
+    def paths(frame: Frame) -> Sequence[Array]:
         shown = frame.shaping if frame.chosen is None else np.arange(len(frame.ghost)) == frame.chosen
         return [path for path, is_shown in zip(frame.ghost, shown, strict=True) if is_shown]
+
+    return OutsideTubes(Lines(scene, "/ghost", STYLES.ghost), paths)
 
 
 class HandAxes(Picture):

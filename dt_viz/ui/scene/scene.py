@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 import viser
@@ -18,17 +18,14 @@ from dt_viz.session.frame import Frame
 from dt_viz.session.opening import Preview
 from dt_viz.session.session import Session
 from dt_viz.ui.scene.arm import ArmSequence
-from dt_viz.ui.scene.bias_points import BiasPoints
 from dt_viz.ui.scene.comparison import ComparedMotions
-from dt_viz.ui.scene.obstacles import Obstacles
+from dt_viz.ui.scene.draggables import BiasPoints, MovableSlice, Obstacles, Starts
 from dt_viz.ui.scene.palette import LIGHT, Theme
 from dt_viz.ui.scene.panels import Panels
 from dt_viz.ui.scene.picture import Look, Picture, add_ball, add_label
-from dt_viz.ui.scene.rollouts import Demonstrations, Ghost, LevelRollouts, Rollouts
-from dt_viz.ui.scene.slice import MovableSlice
+from dt_viz.ui.scene.rollouts import LevelRollouts, Rollouts, demonstrations, ghost
 from dt_viz.ui.scene.slice_layers import ColourSlice, FieldArrows, Generator, OccupancySlice, Streamlines, WarpedGrid
 from dt_viz.ui.scene.stage import Stage
-from dt_viz.ui.scene.starts import Starts
 from dt_viz.ui.scene.style import STYLES
 from dt_viz.ui.scene.takes import Takes
 from dt_viz.ui.scene.tubes import RolloutTubes
@@ -82,9 +79,9 @@ class ScenePictures:
         )
         self._always: tuple[Picture, ...] = (*self.markers, LevelRollouts(scene), Goal(scene))
         self._by_view: dict[str, Picture] = {
-            "demonstrations": Demonstrations(scene),
+            "demonstrations": demonstrations(scene),
             "rollouts": Rollouts(scene),
-            "ghost": Ghost(scene),
+            "ghost": ghost(scene),
             "field": FieldArrows(scene),
             "streamlines": Streamlines(scene),
             "table": Stage(scene),
@@ -145,7 +142,6 @@ class ScenePictures:
         """Draw the last frame again in the colours of another theme."""
         if theme is not self._theme:
             self._theme = theme
-            cast(Stage, self._by_view["table"]).paint(theme)
             self._redraw()
 
     def preview(self, seen: Preview | None, number: int) -> None:

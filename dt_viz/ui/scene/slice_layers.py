@@ -68,32 +68,16 @@ class _Image:
     """An image on a slice."""
 
     def __init__(self, scene: viser.SceneApi, name: str) -> None:
-        self._scene, self._name = scene, name
-        self.handle: viser.ImageHandle | None = None
-        self._size: tuple[float, float] | None = None
+        nothing = np.zeros((1, 1, 4), np.uint8)
+        self.handle = scene.add_image(name, nothing, 1.0, 1.0, format="png", cast_shadow=False, receive_shadow=False)
 
     def show(self, area: Slice, pixels: NDArray[np.uint8]) -> None:
         """Show pixels (n, m, 4) along the first and the second axis of the slice."""
-        pixels = pixels.swapaxes(0, 1)[::-1]  # the first row is the upper one
         right, up = area.axes.T
         turn = transforms.SO3.from_matrix(np.stack([right, -up, -area.normal], axis=1))
-        if self.handle is not None and self._size == area.half_size:
-            self.handle.image = pixels
-            self.handle.wxyz, self.handle.position = turn.wxyz, area.centre
-            return
-        self._size = area.half_size
-        width, height = (2 * half for half in area.half_size)
-        self.handle = self._scene.add_image(
-            self._name,
-            pixels,
-            width,
-            height,
-            format="png",
-            wxyz=turn.wxyz,
-            position=area.centre,
-            cast_shadow=False,
-            receive_shadow=False,
-        )
+        self.handle.wxyz, self.handle.position = turn.wxyz, area.centre
+        self.handle.render_width, self.handle.render_height = (2 * half for half in area.half_size)
+        self.handle.image = pixels.swapaxes(0, 1)[::-1]  # the first row is the upper one
 
 
 class ColourSlice(Picture):

@@ -46,12 +46,12 @@ class Stage(Picture):
             receive_shadow=0.25,
         )
         super().__init__(table)
-        self.paint(LIGHT)
+        self._paint(LIGHT)
 
     def draw(self, frame: Frame, look: Look) -> None:
-        """It changes with the theme only."""
+        if look.theme.table != self.node.color:
+            self._paint(look.theme)
 
-    def paint(self, theme: Theme) -> None:
-        """Take the colours of a theme."""
+    def _paint(self, theme: Theme) -> None:
         self._scene.set_background_image(background(theme), "png")
         self.node.color = theme.table

@@ -9,9 +9,25 @@ from dt_viz.ui.scene.palette import Colour, Theme
 
 @dataclass(frozen=True)
 class Style:
-    """Look of something of one colour."""
+    """Look of something of one colour: of it, what suits a line, a tube, vectors, a ball or a body."""
 
     colour: str
+    width: float = 0.0
+    """Width of a line."""
+    dash: float = 0.0
+    """Length of a dash and of the gap after it; 0 draws through."""
+    radius: float = 0.0
+    """Radius of a tube or a ball."""
+    ball: float = 0.0
+    """Radius of a ball at the beginning of a tube; 0 makes none."""
+    opacity: float | None = None
+    """Opacity of a tube or a body; None is opaque."""
+    weak: str = ""
+    """Colour of the shortest vectors: the larger ones are longer, and nearer to their colour."""
+    length: float = 0.0
+    """Length of the longest vectors."""
+    thickness: float = 1.0
+    """Thickness relative to the vector field's."""
 
     def on(self, theme: Theme, number: int = 0) -> Colour:
         """Return the colour in a theme; `number` tells those apart of which the theme has several of the name."""
@@ -19,110 +35,61 @@ class Style:
         return colour if isinstance(colour[0], int) else colour[number % len(colour)]
 
 
-@dataclass(frozen=True)
-class LineStyle(Style):
-    """Look of lines."""
-
-    width: float
-    dash: float = 0.0
-    """Length of a dash and of the gap after it; 0 draws through."""
-
-
-@dataclass(frozen=True)
-class TubeStyle(Style):
-    """Look of paths as tubes."""
-
-    radius: float
-    ball: float = 0.0
-    """Radius of a ball at the beginning; 0 makes none."""
-    opacity: float | None = None
-
-
-@dataclass(frozen=True)
-class ArrowStyle(Style):
-    """Look of vectors: the larger, the longer and nearer to their colour."""
-
-    weak: str
-    """Colour of the shortest."""
-    length: float
-    """Length of the longest."""
-    thickness: float = 1.0
-    """Thickness relative to the vector field's."""
-
-
-@dataclass(frozen=True)
-class BallStyle(Style):
-    """Look of a ball that marks a place."""
-
-    radius: float
-
-
-@dataclass(frozen=True)
-class SurfaceStyle(Style):
-    """Look of a body that is not opaque."""
-
-    opacity: float
-
-
-@dataclass(frozen=True)
-class Styles:
+class STYLES:
     """All of them: a line inside a tube is thinner than it, what a user moves is easy to hit."""
 
     # lines
-    demonstration: LineStyle = LineStyle("demonstration", 0.0018)
-    ghost: LineStyle = LineStyle("ghost", 0.003, dash=0.012)
-    take: LineStyle = LineStyle("takes", 0.0042)
-    take_given: LineStyle = LineStyle("slice", 0.0012)
-    take_left_out: LineStyle = LineStyle("stale", 0.0026, dash=0.012)
-    way: LineStyle = LineStyle("way", 0.0055)
-    trail: LineStyle = LineStyle("way", 0.005)
-    ink: LineStyle = LineStyle("ink", 0.005)
-    compared_followed: LineStyle = LineStyle("compared", 0.0055)
-    compared: LineStyle = LineStyle("compared", 0.0014)
-    hand_axis: LineStyle = LineStyle("axes", 0.0022)
-    streamline: LineStyle = LineStyle("streamline", 0.0015)
-    grid: LineStyle = LineStyle("grid", 0.0011)
-    grid_beside: LineStyle = LineStyle("grid_beside", 0.0007)
-    generator_motion: LineStyle = LineStyle("generator", 0.0026)
-    slice_border: LineStyle = LineStyle("slice", 0.0022)
-    level_line: LineStyle = LineStyle("level_line", 0.0012)
-    occupancy_level: LineStyle = LineStyle("occupancy_level", 0.0025)
-    outline: LineStyle = LineStyle("outline", 0.0030)
-    body_path: LineStyle = LineStyle("body_path", 0.004)
-    panel_border: LineStyle = LineStyle("slice", 0.0016)
-    panel_grid: LineStyle = LineStyle("grid", 0.0010)
-    panel_streamline: LineStyle = LineStyle("streamline", 0.0011)
+    demonstration = Style("demonstration", width=0.0018)
+    ghost = Style("ghost", width=0.003, dash=0.012)
+    take = Style("takes", width=0.0042)
+    take_given = Style("slice", width=0.0012)
+    take_left_out = Style("stale", width=0.0026, dash=0.012)
+    way = Style("way", width=0.0055)
+    trail = Style("way", width=0.005)
+    ink = Style("ink", width=0.005)
+    compared_followed = Style("compared", width=0.0055)
+    compared = Style("compared", width=0.0014)
+    hand_axis = Style("axes", width=0.0022)
+    streamline = Style("streamline", width=0.0015)
+    grid = Style("grid", width=0.0011)
+    grid_beside = Style("grid_beside", width=0.0007)
+    generator_motion = Style("generator", width=0.0026)
+    slice_border = Style("slice", width=0.0022)
+    level_line = Style("level_line", width=0.0012)
+    occupancy_level = Style("occupancy_level", width=0.0025)
+    outline = Style("outline", width=0.0030)
+    body_path = Style("body_path", width=0.004)
+    panel_border = Style("slice", width=0.0016)
+    panel_grid = Style("grid", width=0.0010)
+    panel_streamline = Style("streamline", width=0.0011)
 
     # paths
-    followed: TubeStyle = TubeStyle("rollout", 0.0034, ball=0.00816)
-    rollout: TubeStyle = TubeStyle("rollout", 0.0020, ball=0.0052, opacity=0.55)
-    added: TubeStyle = TubeStyle("added", 0.0020)
-    level: TubeStyle = TubeStyle("level", 0.0026, ball=0.006)
-    panel_rollout: TubeStyle = TubeStyle("rollout", 0.0022, ball=0.0055)
+    followed = Style("rollout", radius=0.0034, ball=0.00816)
+    rollout = Style("rollout", radius=0.0020, ball=0.0052, opacity=0.55)
+    added = Style("added", radius=0.0020)
+    level = Style("level", radius=0.0026, ball=0.006)
+    panel_rollout = Style("rollout", radius=0.0022, ball=0.0055)
 
     # vectors
-    field: ArrowStyle = ArrowStyle("arrow_fast", "arrow_slow", 0.024)
-    streamline_head: ArrowStyle = ArrowStyle("streamline", "streamline", 0.012)
-    generator: ArrowStyle = ArrowStyle("generator", "generator_weak", 0.030, thickness=1.25)
-    panel_generator: ArrowStyle = ArrowStyle("generator", "generator_weak", 0.030)
+    field = Style("arrow_fast", weak="arrow_slow", length=0.024)
+    streamline_head = Style("streamline", weak="streamline", length=0.012)
+    generator = Style("generator", weak="generator_weak", length=0.030, thickness=1.25)
+    panel_generator = Style("generator", weak="generator_weak", length=0.030)
 
     # places
-    goal: BallStyle = BallStyle("goal", 0.012)
-    end: BallStyle = BallStyle("rollout", 0.009)
-    level_end: BallStyle = BallStyle("level", 0.009)
-    panel_goal: BallStyle = BallStyle("goal", 0.009)
-    start: BallStyle = BallStyle("added", 0.010)
-    bias: BallStyle = BallStyle("bias", 0.011)
-    grip: BallStyle = BallStyle("way", 0.016)
+    goal = Style("goal", radius=0.012)
+    end = Style("rollout", radius=0.009)
+    level_end = Style("level", radius=0.009)
+    panel_goal = Style("goal", radius=0.009)
+    start = Style("added", radius=0.010)
+    bias = Style("bias", radius=0.011)
+    grip = Style("way", radius=0.016)
 
     # bodies
-    obstacle: SurfaceStyle = SurfaceStyle("obstacle", 0.8)
-    obstacle_faint: SurfaceStyle = SurfaceStyle("obstacle", 0.3)
-    obstacle_opened: SurfaceStyle = SurfaceStyle("obstacle", 0.12)
-    arm_stale: SurfaceStyle = SurfaceStyle("arm", 0.4)
-    arm_ghost: SurfaceStyle = SurfaceStyle("ghost", 0.5)
-    body_points: SurfaceStyle = SurfaceStyle("body_point", 0.25)
-    board: SurfaceStyle = SurfaceStyle("board", 0.06)
-
-
-STYLES = Styles()
+    obstacle = Style("obstacle", opacity=0.8)
+    obstacle_faint = Style("obstacle", opacity=0.3)
+    obstacle_opened = Style("obstacle", opacity=0.12)
+    arm_stale = Style("arm", opacity=0.4)
+    arm_ghost = Style("ghost", opacity=0.5)
+    body_points = Style("body_point", opacity=0.25)
+    board = Style("board", opacity=0.06)

@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.metrics import interpolate
 from dt_viz.ui.scene.palette import LIGHT, Theme
-from dt_viz.ui.scene.style import TubeStyle
+from dt_viz.ui.scene.style import Style
 
 NUM_RINGS, NUM_SIDES = 80, 7
 """Numbers of rings along a tube, and of corners of a ring."""
@@ -24,7 +24,7 @@ INSIDE = 0.0035
 class Tubes:
     """Paths of one look as tubes: one mesh, of which a drag moves the vertices."""
 
-    def __init__(self, scene: viser.SceneApi, name: str, style: TubeStyle) -> None:
+    def __init__(self, scene: viser.SceneApi, name: str, style: Style) -> None:
         """Make an empty set of this name in the scene tree."""
         self._style = style
         self.node = scene.add_mesh_simple(

@@ -75,15 +75,8 @@ def add_commands(gui: viser.GuiApi, bindings: Bindings, commands: Sequence[Comma
 def add_about(gui: viser.GuiApi, commands: Sequence[Command]) -> None:
     """Build the folder "About" where the panel is being built, closed."""
     with gui.add_folder("About: paper, colours, keys", expand_by_default=False):
-        gui.add_html(paper_html() + legend_html() + keys_html(commands))
-
-
-def paper_html() -> str:
-    """Return title, authors and venue of the paper, with a link."""
-    return small(
-        f"<a href='{LINK}' target='_blank' rel='noopener noreferrer' style='font-weight:600'>"
-        f"{TITLE}</a><br/>{AUTHORS}<br/>{VENUE}"
-    )
+        link = f"<a href='{LINK}' target='_blank' rel='noopener noreferrer' style='font-weight:600'>{TITLE}</a>"
+        gui.add_html(small(f"{link}<br/>{AUTHORS}<br/>{VENUE}") + legend_html() + keys_html(commands))
 
 
 def legend_html() -> str:

@@ -11,86 +11,66 @@ import viser
 
 from dt_viz.scenario.roaming import Chase, MovingGoal
 from dt_viz.scenario.scenario import Scenario
-from dt_viz.session import player
 from dt_viz.session.frame import Stage
+from dt_viz.session.player import Play
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import KEEP, Bindings
 
 OBSTACLE_SPEEDS: Mapping[str, float] = {"Obstacle": 0.08, "Fast obstacle": 0.25}
 """Speeds of the obstacle that crosses the motion, by their names on the page, m/s."""
-GOAL, STOP = "Goal", "Stop"
-PUSH_HINT = (
-    "a few centimetres to a side: it goes on from there, and still reaches the goal; or drag the ball at the hand"
-)
-
-
-MODEL_HINT = "the arm: the task is placed in its reach, with all that is there; one that is new takes up to a minute"
+GOAL = "Goal"
 
 
 def add_arm(gui: viser.GuiApi, bindings: Bindings, arms: Mapping[str, str], begin: Callable[..., None]) -> None:
-    """Build the controls where the panel is being built.
-
-    Args:
-        gui: controls of the visitor.
-        bindings: of them.
-        arms: titles of the arms that may be chosen, by their names.
-        begin: as `ControlPanel.begin`.
-    """
+    """Build the controls where the panel is being built; for the titles of arms by name, and `ControlPanel.begin`."""
     names = {title: name for name, title in arms.items()}
+    hint = "the arm: the task is placed in its reach, with all that is there; one that is new takes up to a minute"
     bindings.choice(
-        gui.add_dropdown("Model", tuple(names), hint=MODEL_HINT),
+        gui.add_dropdown("Model", tuple(names), hint=hint),
         lambda s: arms[s.arm],
         partial(begin, lambda session, title: session.choose_arm(names[title])),
     )
-    play = gui.add_button("Pause")
-    bindings.properties(play, label=lambda s: "Pause" if s.view.playing else "Play")
-    bindings.on(play, play_or_pause)
-    bindings.slider(gui, "speed", 0.25, 3.0, 0.25)
-    push = gui.add_button("Push the hand", icon=viser.Icon.HAND_FINGER, disabled=True, hint=PUSH_HINT)
+    bindings.on(gui.add_button("Pause"), play_or_pause, label=lambda s: "Pause" if s.view.playing else "Play")
+    bindings.slider(gui, "speed")
 
     def stands(scenario: Scenario) -> bool:
         frame = bindings.frame
         has_no_motion = frame is None or (frame.arm is None and frame.stage >= Stage.FINE)
         return has_no_motion or scenario.view.replay or not scenario.view.playing
 
-    bindings.properties(push, disabled=stands)
-    bindings.on(push, lambda session, _pressed: session.engine.arm.push())
+    hint = (
+        "a few centimetres to a side: it goes on from there, and still reaches the goal; or drag the ball at the hand"
+    )
+    push = gui.add_button("Push the hand", icon=viser.Icon.HAND_FINGER, disabled=True, hint=hint)
+    bindings.on(push, lambda session, _pressed: session.engine.arm.push(), disabled=stands)
     bindings.checkbox(gui, "replay")
-    add_disturbances(gui, bindings)
-    hint = "number of the rollout that the arm follows: first those of the demonstrations, then added ones"
-    followed = gui.add_slider("Follows rollout", 1, 8, 1, 1, hint=hint)
+    hint = "by itself: the selected obstacle crosses the motion again and again, or the goal moves"
+    buttons, rng = gui.add_button_group("Disturb", (*OBSTACLE_SPEEDS, GOAL), hint=hint), np.random.default_rng(0)
+
+    def disturbance(session: Session, button: str) -> Play | None:
+        frame = bindings.frame
+        if frame is None:
+            return None
+        if button == GOAL:
+            return MovingGoal(frame.task, frame.reached)
+        return Chase(frame.task, session.scenario, OBSTACLE_SPEEDS[button], rng)
+
+    bindings.plays(buttons, "Disturb", disturbance, returns=True)
 
     def num_rollouts(_scenario: Scenario) -> int:
         frame = bindings.frame
         return KEEP if frame is None else len(frame.task.demonstrations) + len(frame.scenario.starts)
 
-    bindings.properties(followed, max=num_rollouts)
-    bindings.input(followed, lambda s: s.arm_rollout + 1, lambda _s, value: {"arm_rollout": int(value) - 1})
+    hint = "number of the rollout that the arm follows: first those of the demonstrations, then added ones"
+    bindings.input(
+        gui.add_slider("Follows rollout", 1, 8, 1, 1, hint=hint),
+        lambda s: s.arm_rollout + 1,
+        lambda _s, value: {"arm_rollout": int(value) - 1},
+        max=num_rollouts,
+    )
 
 
 def play_or_pause(session: Session, _pressed: bool = True) -> None:
     """Let the arm move, or hold it."""
     view = session.scenario.view
     session.edit("play", view=replace(view, playing=not view.playing))
-
-
-def add_disturbances(gui: viser.GuiApi, bindings: Bindings) -> None:
-    """Build the buttons of what disturbs the arm by itself, which become a stop button meanwhile."""
-    rng = np.random.default_rng(0)
-    hint = "by itself: the selected obstacle crosses the motion again and again, or the goal moves"
-    buttons = gui.add_button_group("Disturb", (*OBSTACLE_SPEEDS, GOAL), hint=hint)
-
-    def show(playing: bool) -> None:
-        buttons.options = (STOP,) if playing else (*OBSTACLE_SPEEDS, GOAL)
-
-    def press(session: Session, button: str) -> None:
-        frame = bindings.frame
-        if button == STOP or frame is None:
-            player.stop(session)
-            return
-        play: player.Play = MovingGoal(frame.task, frame.reached)
-        if button != GOAL:
-            play = Chase(frame.task, session.scenario, OBSTACLE_SPEEDS[button], rng)
-        player.start(session, "Disturb", play, show, returns=True)
-
-    bindings.on(buttons, press)

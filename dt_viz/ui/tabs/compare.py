@@ -45,14 +45,13 @@ class ComparePanel:
     """Controls of the comparison, its table, and figure 6 of the paper for one motion."""
 
     def __init__(self, gui: viser.GuiApi, bindings: Bindings) -> None:
-        """Build the controls in the tab that is open."""
         self._drawn: tuple[str, ...] = ()
         """Names of the methods in the plots."""
         with gui.add_folder("Methods"):  # closed by a click, so that the table is seen at once on a small screen
             for method in OTHERS:
                 label = SHORT.get(method.name, method.title)
                 box = gui.add_checkbox(label, False, disabled=bool(method.missing), hint=hint(method))
-                bindings.input(box, partial(_is_compared, method.name), partial(_compare, method.name))
+                bindings.input(box, lambda s, name=method.name: name in s.view.compared, partial(_compare, method.name))
         self.table = gui.add_html("", visible=False)
         titles = {method.title: method.name for method in OTHERS if not method.missing}
         by_name = {name: title for title, name in titles.items()}
@@ -63,11 +62,10 @@ class ComparePanel:
             lambda s: by_name.get(s.view.their_arm, NONE),
             lambda s, title: _with_their_arm(s, titles.get(title, "")),
         )
-        self.folder = gui.add_folder("Along the path (fig. 6)", visible=False)
-        with self.folder:
+        with (folder := gui.add_folder("Along the path (fig. 6)", visible=False)):
             self.plots = tuple(add_plot(gui, title, "path", _curves(()), 130) for title in TITLES)
-        bindings.properties(self.folder, visible=lambda s: bool(s.view.compared))
-        bindings.properties(self.table, visible=lambda s: bool(s.view.compared))
+        for handle in (folder, self.table):
+            bindings.properties(handle, visible=lambda s: bool(s.view.compared))
 
     def draw(self, comparison: Sequence[Compared]) -> None:
         """Show how methods fare; nothing leaves what is there."""
@@ -136,10 +134,6 @@ def _colour(name: str) -> tuple[int, int, int]:
 
 def _curves(names: Sequence[str]) -> tuple[uplot.Series, ...]:
     return tuple(curve(name, _colour(name)) for name in (names or (OURS.name,)))
-
-
-def _is_compared(name: str, scenario: Scenario) -> bool:
-    return name in scenario.view.compared
 
 
 def _compare(name: str, scenario: Scenario, shown: bool) -> dict[str, Any]:

@@ -44,18 +44,14 @@ def has_room(scenario: Scenario) -> bool:
 
 
 @contextmanager
-def turn(wait: Callable[[], None], left: Cancelled) -> Iterator[None]:
-    """Wait until no other visitor's file is being read, and read within the block.
-
-    Args:
-        wait: called if that has to be waited for.
-        left: whether the visitor has left.
+def turn(say: Callable[[str, Severity], None], left: Cancelled) -> Iterator[None]:
+    """Wait until no other visitor's file is being read, which is said, and read within the block.
 
     Raises:
         UnwantedError: the visitor has left, before the block or within it.
     """
     if not _one_file.acquire(blocking=False):
-        wait()
+        say("Another visitor's file is being read; yours is read after it.", Severity.WARNING)
         while not _one_file.acquire(timeout=0.1):  # the visitor may leave meanwhile
             end_if(left)
     try:
@@ -103,13 +99,12 @@ class FileLoader:
         """
         session, self._refused, self._upload.disabled = self._bindings.session, None, True
         left = partial(session.jobs.superseded, LANE)
-        wait = "Another visitor's file is being read; yours is read after it."
         try:
             if not has_room(session.scenario):
                 raise ShapeError(
                     name, "scene", f"{MAX_OBSTACLES} obstacles", f"at most {MAX_OBSTACLES}: delete one first"
                 )
-            with turn(partial(session.say, wait, Severity.WARNING), left):
+            with turn(session.say, left):
                 obstacle, notes = from_file(content, name, scale, left)
             self._add(session, obstacle)
             if notes:
@@ -135,11 +130,11 @@ class FileLoader:
 def from_file(
     content: bytes, name: str, scale: float, cancelled: Cancelled = never
 ) -> tuple[Obstacle, tuple[str, ...]]:
-    """Return the obstacle that a file holds, around the origin, and notes about it for the page.
+    """Return the obstacle that a file of such a suffix holds, around the origin, and notes about it for the page.
 
     Args:
-        content: all bytes of the file.
-        name: name of the file; its suffix says what it is. A PLY without faces is a point cloud.
+        content: all bytes of the file; a PLY without faces is a point cloud.
+        name: name of the file.
         scale: metres for one unit of the file.
         cancelled: whether nobody wants it any more.
 
@@ -151,7 +146,7 @@ def from_file(
     if suffix not in (*MESH_SUFFIXES, *CLOUD_SUFFIXES):
         raise ShapeError(name, "suffix", repr(suffix) if suffix else "no suffix", FORMATS)
     if is_cloud(content, name):
-        loaded = read_cloud(content, name, scale=scale, cancelled=cancelled)
-        return CloudObstacle(ORIGIN, loaded.cloud), loaded.notes
-    loaded = read_mesh(content, name, scale=scale, cancelled=cancelled)
-    return MeshObstacle(ORIGIN, loaded.solid), loaded.notes
+        cloud, notes = read_cloud(content, name, scale=scale, cancelled=cancelled)
+        return CloudObstacle(ORIGIN, cloud), notes
+    solid, notes = read_mesh(content, name, scale=scale, cancelled=cancelled)
+    return MeshObstacle(ORIGIN, solid), notes

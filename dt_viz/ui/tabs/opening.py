@@ -21,8 +21,8 @@ from dt_viz.session.opening import LENGTHS, USUAL_RATES, Choices, Preview
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.controls import Control
-from dt_viz.ui.dropping import drop_html
 from dt_viz.ui.scene.palette import LIGHT
+from dt_viz.ui.scripts import drop_html
 from dt_viz.ui.tabs.from_file import LANE, turn
 from dt_viz.ui.tabs.takes_table import seen_html
 from dt_viz.warning import Severity
@@ -74,15 +74,7 @@ class OpenPanel:
     def __init__(
         self, gui: viser.GuiApi, bindings: Bindings, show: Show, learn: Callable[[Session, Task], None], most: int
     ) -> None:
-        """Build the controls where the panel is being built.
-
-        Args:
-            gui: controls of the visitor.
-            bindings: bindings of the panel.
-            show: shows what is open in the scene.
-            learn: has a task learned.
-            most: largest number of bytes of all files.
-        """
+        """Build the controls where the panel is being built; files may have `most` bytes together."""
         self._bindings, self._show, self._learn, self._most = bindings, show, learn, most
         self._changing = threading.RLock()  # one thread reads, another inspects, and handlers close what is open
         self._opened = Opened()
@@ -195,10 +187,9 @@ class OpenPanel:
             UnwantedError: the visitor has left, or has closed what was open.
         """
         opened, session, self.upload.disabled = self._opened, self._bindings.session, True
-        wait = "Another visitor's file is being read; yours is read after it."
         unwanted = lambda: session.jobs.closed or not self.folder.visible  # noqa: E731
         try:
-            with turn(partial(session.say, wait, Severity.WARNING), unwanted):
+            with turn(session.say, unwanted):
                 known = opening.read(opened.files, opened.answers, session.robot, unwanted)
             opening.preview(known, opened.choices, session.robot)
             if len(opened.files) > opened.num_read and len(known.takes) <= len(opened.recordings.takes):
@@ -238,7 +229,6 @@ class OpenPanel:
                 self._draw()
 
     def _choose(self, change: Callable[[Choices], Mapping[str, Any]]) -> None:
-        """Have choices changed."""
         with self._changing:
             choices = self._opened.choices
             self._opened = replace(self._opened, choices=replace(choices, **change(choices)))
@@ -257,7 +247,6 @@ class OpenPanel:
 
     @property
     def _number(self) -> int:
-        """Number of the take that is chosen."""
         options = self.controls["take"].handle.options
         value = self.controls["take"].value
         return options.index(value) if value in options else 0
@@ -281,7 +270,6 @@ class OpenPanel:
     # --- what is shown ---
 
     def _draw(self) -> None:
-        """Show what is open."""
         seen, opened = self._seen, self._opened
         self.controls["learn"].handle.disabled = seen is None or seen.task is None
         if seen is None:
@@ -325,7 +313,6 @@ class OpenPanel:
         control.handle.visible = bool(options)
 
     def _turn(self, name: str, on: bool, *, shown: bool) -> None:
-        """Show a checkbox, or hide it."""
         self.controls[name].value, self.controls[name].handle.visible = on, shown
 
 

@@ -55,17 +55,7 @@ class PictureTab:
         enlarge: Callable[[bool], None],
         save_png: Callable[[str, bool], None],
     ) -> None:
-        """Build the controls where the panel is being built.
-
-        Args:
-            gui: controls of the visitor.
-            bindings: bindings of the visitor's panel.
-            tripod: stand of the visitor's camera.
-            presentation: the visitor's presentation.
-            darken: takes whether the theme is the dark one.
-            enlarge: takes whether the type is large.
-            save_png: makes a picture, given the resolution's name and whether it is transparent.
-        """
+        """Build the controls where the panel is being built; `save_png` takes a resolution, and whether transparent."""
         self._tripod = tripod
         gui.add_html(ROW)
         Control(gui.add_button_group("View", (*VIEWS, HAND, HOME)), tripod.view)
@@ -113,37 +103,31 @@ class PictureTab:
             self._save.disabled = False
 
 
-class BigType:
-    """Size of the type of one visitor's page, and width of the panel."""
+def big_type(gui: viser.GuiApi, tripod: CameraController) -> Callable[[bool], None]:
+    """Return what shows large type beside a wider panel, or the usual one.
 
-    def __init__(self, gui: viser.GuiApi, tripod: CameraController) -> None:
-        """Begin with the usual size; must be built outside tabs and folders, of which closed ones have no style."""
-        # viser measures its page in rem or em, of 92.5 % of the browser's type; on a phone the panel fills the window
-        style = f"<style>@media (min-width: 577px) {{ :root {{ font-size: {92.5 * LARGER}%; }} }}</style>"
-        self._style, self._panel, self._tripod = gui.add_html(style, visible=False), gui.main_panel, tripod
+    Its style must be added outside tabs and folders, of which closed ones have none.
+    """
+    # viser measures its page in rem or em, of 92.5 % of the browser's type; on a phone the panel fills the window
+    text = f"<style>@media (min-width: 577px) {{ :root {{ font-size: {92.5 * LARGER}%; }} }}</style>"
+    style, usual = gui.add_html(text, visible=False), 320.0  # width of viser's panel, CSS pixels
 
-    def show(self, on: bool) -> None:
-        """Show large type, or the usual one, and frame the scene beside the wider panel."""
-        usual = 320.0  # of viser's panel, CSS pixels
+    def show(on: bool) -> None:
         wider = (LARGER - 1) * usual if on else 0.0
-        self._style.visible = on
-        self._panel.set_width(usual + wider)
-        self._tripod.reframe(panel=Framing.panel + wider)
+        style.visible = on
+        gui.main_panel.set_width(usual + wider)
+        tripod.reframe(panel=Framing.panel + wider)
+
+    return show
 
 
 class Presentation:
     """Title and caption of what is shown, in place of the panel while it is on."""
 
     def __init__(self, gui: viser.GuiApi, turn: Callable[[int], None], present: Callable[[bool], None]) -> None:
-        """Build its controls where the panel is being built, hidden.
-
-        Args:
-            gui: controls of the visitor.
-            turn: goes so many scenes on, or back; must only submit.
-            present: called when the presentation begins, and when it ends.
-        """
+        """Build its controls where the panel is being built, hidden; `turn`, by so many scenes, must only submit."""
         self._panel, self._turn, self._present = gui.main_panel, turn, present
-        self._title = self._caption = ""
+        self._texts = {"title": "", "caption": ""}
         self._html = gui.add_html("", visible=False)
         self._buttons = gui.add_button_group("Presentation", (BACK, ON, END), visible=False)
         Control(self._buttons, self._press)
@@ -171,19 +155,11 @@ class Presentation:
             self._html.visible = self._buttons.visible = on
             self._present(on)
 
-    def entitle(self, title: str) -> None:
-        """Take the title of what is shown."""
-        self._title = title
-        self._write()
-
-    def caption(self, text: str) -> None:
-        """Take the line that says what to see."""
-        self._caption = text
-        self._write()
-
-    def _write(self) -> None:
-        title, caption = html.escape(self._title), html.escape(self._caption)
-        self._html.content = f"{ALONE}<div class='dt-caption'><h1>{title}</h1><p>{caption}</p></div>"
+    def write(self, **texts: str) -> None:
+        """Change the title of what is shown, or the caption that says what to see."""
+        self._texts |= {name: html.escape(text) for name, text in texts.items()}
+        shown = "<h1>{title}</h1><p>{caption}</p>".format(**self._texts)
+        self._html.content = f"{ALONE}<div class='dt-caption'>{shown}</div>"
 
     def _press(self, button: str) -> None:
         if button == END:

@@ -37,15 +37,7 @@ def small(text: str, *, tight: bool = False) -> str:
 def add_plot(
     gui: viser.GuiApi, title: str, across: str, curves: Sequence[uplot.Series], height: int
 ) -> viser.GuiUplotHandle:
-    """Add an empty plot below its title, which is HTML, where the panel is being built.
-
-    Args:
-        gui: controls of the visitor.
-        title: title; none if empty.
-        across: what is told to the right.
-        curves: its curves.
-        height: height, pixels.
-    """
+    """Add an empty plot of curves below its title, which is HTML, where the panel is being built."""
     if title:
         gui.add_html(small(title, tight=True))
     font = "11px sans-serif"
@@ -150,7 +142,6 @@ class HealthPlots(Shown):
     """A folder with three plots and a table: the shown motion beside the one without avoidance and biases."""
 
     def __init__(self, gui: viser.GuiApi) -> None:
-        """Make the folder, hidden."""
         self._drawn: Profiles | None = None
         folder = gui.add_folder("Along the path", visible=False)
         super().__init__(folder)
@@ -167,7 +158,6 @@ class HealthPlots(Shown):
             self.clearance = self._plot(gui, "", palette.LIGHT.goal, contact)
 
     def _plot(self, gui: viser.GuiApi, title: str, colour: Colour, *more: uplot.Series) -> viser.GuiUplotHandle:
-        """Add a plot of the pair of curves, and more curves."""
         without = curve("without", colour, width=1.5, dashed=True)
         return add_plot(gui, title, "path", (curve("shown", colour), without, *more), 130)
 

@@ -13,9 +13,8 @@ from dt_viz.avoidance.page import Choice, FlowIntegration, Number, PageEntry, Se
 from dt_viz.avoidance.transform import Transform
 from dt_viz.flows.diffeomorphisms import MAX_STEPS, Method
 from dt_viz.scenario.scenario import Scenario
-from dt_viz.scenario.stack import WHOLE_ARM, transform_of, with_transform
-from dt_viz.session.frame import Frame
-from dt_viz.ui.bindings import KEEP, Bindings
+from dt_viz.scenario.stack import transform_of, with_transform
+from dt_viz.ui.bindings import KEEP, Bindings, Handle, Read, Value
 from dt_viz.ui.controls import Control
 
 Chosen = Callable[[Scenario], str | None]
@@ -27,15 +26,7 @@ Offered = Callable[[PageEntry], Iterable[Setting]]
 def add_settings(
     gui: viser.GuiApi, bindings: Bindings, offered: Offered, chosen: Chosen, order: float | None = None
 ) -> None:
-    """Build the controls of the settings of all kinds of transforms.
-
-    Args:
-        gui: controls of the visitor, in the folder that they go into.
-        bindings: bindings of the visitor's panel.
-        offered: settings of a kind that are shown here.
-        chosen: transform whose settings they are.
-        order: order of all of them in the folder.
-    """
+    """Build the controls of the settings of all kinds of transforms, of which those of the chosen one are shown."""
     for setting in dict.fromkeys(setting for entry in registry.KINDS.values() for setting in offered(entry)):
         _SettingField(gui, bindings, offered, chosen, setting).add({"order": order, "visible": False})
 
@@ -47,14 +38,6 @@ def settings_of_purpose(kind: PageEntry) -> tuple[Setting, ...]:
         for setting in kind.settings
         if isinstance(setting, Switch) or (isinstance(setting, Number) and not setting.of_flow)
     )
-
-
-def chosen_values(frame: Frame) -> dict[str, Mapping[str, float]]:
-    """Return the values that each transform chose automatically, by its name and its fields."""
-    values = {layer.name: chosen for layer, chosen in zip(frame.scenario.stack, frame.chosen_values, strict=False)}
-    if frame.arm_duration is not None:
-        values[WHOLE_ARM] = {"duration": frame.arm_duration}
-    return values
 
 
 @dataclass(frozen=True)
@@ -73,10 +56,10 @@ class _SettingField:
         transform = None if name is None else transform_of(scenario, name)
         return transform if transform and self.setting in self.offered(registry.entry_of(transform)) else None
 
-    def read(self, of_value: Callable[[Any], Any], otherwise: Any) -> Callable[[Scenario], Any]:  # noqa: ANN401
+    def read(self, of_value: Callable[[Value], Value], otherwise: Value) -> Read:
         """Return a function of a scenario: `of_value` of the field, or `otherwise` where there is none."""
 
-        def read(scenario: Scenario) -> Any:  # noqa: ANN401
+        def read(scenario: Scenario) -> Value:
             transform = self.transform(scenario)
             return otherwise if transform is None else of_value(getattr(transform, self.setting.field))
 
@@ -84,35 +67,32 @@ class _SettingField:
 
     def bind(
         self,
-        handle: Any,  # noqa: ANN401
-        shown: Callable[[Any], Any],
-        meant: Callable[[Any, Any], Any],
-        visible: Callable[[Any], bool] = lambda _value: True,
+        handle: Handle,
+        shown: Callable[[Value], Value],
+        meant: Callable[[Value, Value], Value],
+        visible: Callable[[Value], bool] = lambda _value: True,
+        **properties: Read,
     ) -> Control:
-        """Bind an input to the field.
+        """Bind an input, visible where there is a field to be seen, to it.
 
-        Args:
-            handle: handle of the input.
-            shown: value of the input for the field's.
-            meant: value of the field for its old one and the input's.
-            visible: whether the input is shown for the field's value; it never is where there is no field.
+        `shown` is the input's value for the field's, `meant` the field's for its old one and the input's.
         """
 
-        def change(scenario: Scenario, value: Any) -> Mapping[str, Any]:  # noqa: ANN401
+        def change(scenario: Scenario, value: Value) -> Mapping[str, Any]:
             name, transform = self.chosen(scenario), self.transform(scenario)
             if name is None or transform is None:
                 return {}
             changed = {self.setting.field: meant(getattr(transform, self.setting.field), value)}
             return {"stack": with_transform(scenario, name, replace(transform, **changed))}
 
-        self.bindings.properties(handle, visible=self.read(visible, otherwise=False))
-        return self.bindings.input(handle, self.read(shown, otherwise=KEEP), change)
+        properties["visible"] = self.read(visible, otherwise=False)
+        return self.bindings.input(handle, self.read(shown, otherwise=KEEP), change, **properties)
 
     def suggestion(self) -> float | None:
         """Return the value that the chosen transform chose automatically, if it is known."""
         scenario, frame = self.bindings.scenario, self.bindings.frame
         name = None if scenario is None else self.chosen(scenario)
-        return None if name is None or frame is None else chosen_values(frame).get(name, {}).get(self.setting.field)
+        return None if name is None or frame is None else frame.chosen_values.get(name, {}).get(self.setting.field)
 
     def add(self, given: dict[str, Any]) -> None:
         """Build its controls where the panel is being built, with the options of viser that are given."""
@@ -152,8 +132,8 @@ class _SettingField:
             self.gui.add_slider(f"{setting.label} {setting.unit}", *limits, hint=hint, **given),
             shown,
             lambda before, number: None if before is None else number / setting.scale,
+            disabled=self.read(lambda value: value is None, otherwise=KEEP),
         )
-        self.bindings.properties(slider.handle, disabled=self.read(lambda value: value is None, otherwise=KEEP))
 
     def _add_integration(self, given: dict[str, Any]) -> None:
         hint = "auto: errors stay invisible; the others take equal steps, and the status warns of their errors"

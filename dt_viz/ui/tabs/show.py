@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import viser
 
-from dt_viz.scenario.scenario import OFFERS, SLICE_COLOURS, Scenario, SliceColour
+from dt_viz.scenario.scenario import OFFERS, SLICE_COLOURS, Scenario
 from dt_viz.scenario.stack import side_by_side
 from dt_viz.session.frame import Frame
 from dt_viz.session.session import Session
@@ -15,13 +14,6 @@ from dt_viz.ui.bindings import KEEP, Bindings
 from dt_viz.ui.scene.legend import OCCUPANCY, Legend, legend_of
 from dt_viz.ui.tabs.plots import HealthPlots, JointPlots, small
 
-COLOUR_LABELS: Mapping[SliceColour, str] = {
-    "none": "None",
-    "det": "det J",
-    "lyapunov": "Lyapunov value",
-    "occupancy": "Learned occupancy",
-}
-assert set(COLOUR_LABELS) == set(SLICE_COLOURS)
 WHOLE_ARM_NOTE = "The slice shows the stack of the hand's path; what the whole arm avoids with is not in it."
 IN_SCENE = (
     "rollouts",
@@ -45,55 +37,44 @@ class ShowTab:
     """The controls of one visitor's tab."""
 
     def __init__(self, gui: viser.GuiApi, bindings: Bindings) -> None:
-        """Build the controls where the panel is being built."""
-        self.slice = SlicePanel(gui, bindings)
+        self._bindings = bindings
+        self.legend: Legend | None = None
+        """Legend of the colours that are shown on the slice."""
+        self._add_slice(gui, bindings)
         # each plot under its checkbox, high up in the tab, to be seen when it opens
         bindings.checkbox(gui, "joint_plots")
-        self.joints = JointPlots(gui)
-        bindings.properties(self.joints, visible=lambda s: s.view.joint_plots)
+        self.joints = bindings.properties(JointPlots(gui), visible=lambda s: s.view.joint_plots)
         bindings.checkbox(gui, "health_plots")
-        self.health = HealthPlots(gui)
-        bindings.properties(self.health, visible=lambda s: s.view.health_plots)
+        self.health = bindings.properties(HealthPlots(gui), visible=lambda s: s.view.health_plots)
         for name in IN_SCENE:
             if name == "panels":
                 box = gui.add_checkbox(OFFERS[name].label, False, hint=OFFERS[name].hint)
-                bindings.input(box, lambda s: bool(s.view.panels), _with_panels)
+                bindings.view(box, "panels", bool, lambda on: side_by_side(bindings.session.scenario) if on else ())
             else:
                 bindings.checkbox(gui, name)
-        # up to three flows, until a picture of the generator says how many there are
-        flow = bindings.slider(gui, "generator_layer", 0, 3, 1, visible=False)
-        bindings.properties(flow, visible=lambda s: s.view.generator, max=lambda _s: _num_flows(bindings.frame))
+        num_flows = lambda _s: _num_flows(bindings.frame)  # noqa: E731
+        bindings.slider(gui, "generator_layer", visible=lambda s: s.view.generator, max=num_flows)
 
     def draw(self, frame: Frame) -> None:
         """Show a frame in the plots."""
         self.joints.follow(frame.arm)
         self.health.draw(frame.profiles)
 
-
-class SlicePanel:
-    """The controls of the slice, with a legend of its colours."""
-
-    def __init__(self, gui: viser.GuiApi, bindings: Bindings) -> None:
-        """Build the controls where the panel is being built."""
-        self._bindings = bindings
+    def _add_slice(self, gui: viser.GuiApi, bindings: Bindings) -> None:
+        """Add the controls of the slice, with a legend of its colours."""
         bindings.checkbox(gui, "move_slice")
         self.back = gui.add_button("Back to the task's slice", visible=False)
-        bindings.properties(self.back, visible=lambda s: s.view.slice is not None)
-        bindings.on(self.back, _put_back)
-        names = {label: name for name, label in COLOUR_LABELS.items()}
-        colour = gui.add_dropdown("Slice colour", tuple(names), hint="quantity shown as colour on the slice")
-        bindings.view(colour, "colour", COLOUR_LABELS.__getitem__, names.__getitem__)
-        phase = bindings.slider(gui, "phase", 0.0, 1.0, 0.01, visible=False)
+        bindings.on(self.back, _put_back, visible=lambda s: s.view.slice is not None)
+        names = {label: name for name, label in SLICE_COLOURS.items()}
+        colour = gui.add_dropdown(OFFERS["colour"].label, tuple(names), hint=OFFERS["colour"].hint)
+        bindings.view(colour, "colour", SLICE_COLOURS.__getitem__, names.__getitem__)
+        of_phase = {
+            "visible": lambda _s: bindings.frame is not None and bindings.frame.remembers,
+            "disabled": lambda s: not _shows_velocities(s),
+        }
+        bindings.slider(gui, "phase", **of_phase)
         take = gui.add_button("Take the arm's phase", visible=False)
-        bindings.on(take, lambda session, _pressed: session.take_phase())
-        for handle in (phase, take):
-            bindings.properties(
-                handle,
-                visible=lambda _s: bindings.frame is not None and bindings.frame.remembers,
-                disabled=lambda s: not _shows_velocities(s),
-            )
-        self.legend: Legend | None = None
-        """Legend of the colours that are shown."""
+        bindings.on(take, lambda session, _pressed: session.take_phase(), **of_phase)
         self.key = gui.add_html("", visible=False)
         bindings.show(self._legend_of, self._explain)
         self.note = gui.add_html(small(WHOLE_ARM_NOTE), visible=False)
@@ -114,10 +95,6 @@ class SlicePanel:
 
 def _put_back(session: Session, _pressed: bool) -> None:
     session.step("slice", view=replace(session.scenario.view, slice=None))
-
-
-def _with_panels(scenario: Scenario, shown: bool) -> dict[str, object]:
-    return {"view": replace(scenario.view, panels=side_by_side(scenario) if shown else ())}
 
 
 def _num_flows(frame: Frame | None) -> int:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import html
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import zip_longest
 from typing import Any
 
 import viser
@@ -31,7 +33,6 @@ from dt_viz.scenario.stack import (
     tuned,
 )
 from dt_viz.scenario.tasks import STYLES
-from dt_viz.session import player
 from dt_viz.session.frame import Frame
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import Bindings
@@ -43,7 +44,7 @@ from dt_viz.ui.tabs.settings import add_settings, settings_of_purpose
 
 BASE = "Base attractor"
 ON, OFF, UP, DOWN, SHOW, SHOWN = "● on", "○ off", "↑", "↓", "show", "● shown"
-WARP, PLAY, STOP = "Warp", "▶ 0 → 1", "Stop"
+WARP = "Warp"
 SECONDS = 5.0
 """Duration of playing the warp."""
 NO_STYLE = "–"
@@ -65,7 +66,6 @@ class StackPanel:
     """The stack, a row for each transform."""
 
     def __init__(self, gui: viser.GuiApi, bindings: Bindings) -> None:
-        """Build an empty list, the warp and the settings."""
         self._gui, self._bindings = gui, bindings
         bindings.properties(gui.add_html(""), content=formula_html)
         self._folder = gui.add_folder("Stack, the outermost on top")
@@ -76,36 +76,28 @@ class StackPanel:
             add_warp(gui, bindings, below)
             add_transform_settings(gui, bindings, below + 2)
         bindings.show(self._wanted, self._show)
-        legend = gui.add_html(
-            "", visible=False
-        )  # at the end: it appears and disappears, which would move controls below it
+        legend = gui.add_html("", visible=False)  # at the end: as it comes and goes it moves no controls
         bindings.properties(legend, content=legend_html, visible=lambda s: bool(legend_html(s)))
 
     def _wanted(self, scenario: Scenario) -> tuple[StackRow, ...]:
         frame = self._bindings.frame
-        return rows(scenario, {} if frame is None else durations(frame))
+        return rows(scenario, {} if frame is None else frame.durations)
 
     def _show(self, wanted: tuple[StackRow, ...]) -> None:
         """Reuse the rows that there are, from the top; those that are not needed are hidden."""
         self._shown = wanted
-        while len(self.rows) < len(wanted):
-            self._add_row(wanted[len(self.rows)])
-        for handle, row in zip(self.rows, wanted, strict=False):
-            handle.label, handle.options, handle.visible = row.label, row.buttons, True
-        for handle in self.rows[len(wanted) :]:
-            handle.visible = False
-
-    def _add_row(self, row: StackRow) -> None:
-        k = len(self.rows)
         with self._folder:
-            handle = self._gui.add_button_group(row.label, row.buttons)
-        self.rows.append(handle)
+            for k in range(len(self.rows), len(wanted)):
+                self.rows.append(self._gui.add_button_group(wanted[k].label, wanted[k].buttons))
+                self._bindings.on(self.rows[k], partial(self._press, k))
+        for handle, row in zip_longest(self.rows, wanted):
+            handle.visible = row is not None
+            if row is not None:
+                handle.label, handle.options = row.label, row.buttons
 
-        def pressed(session: Session, button: str) -> None:
-            if k < len(self._shown):
-                press(session, self._shown[k].name, button)
-
-        self._bindings.on(handle, pressed)
+    def _press(self, k: int, session: Session, button: str) -> None:
+        if k < len(self._shown):
+            press(session, self._shown[k].name, button)
 
 
 def press(session: Session, name: str, button: str) -> None:
@@ -113,7 +105,7 @@ def press(session: Session, name: str, button: str) -> None:
     session.step(f"{name} {button}", **_ACTIONS[button](session.scenario, name))
 
 
-def rows(scenario: Scenario, durations: Mapping[str, float | None]) -> tuple[StackRow, ...]:
+def rows(scenario: Scenario, durations: Mapping[str, float]) -> tuple[StackRow, ...]:
     """Return the rows from the top down, with the durations of the last frame."""
     on = {layer.name for layer in scenario.stack if layer.on}
     seen, order, rows = levels(scenario), listed(scenario), []
@@ -130,12 +122,6 @@ def rows(scenario: Scenario, durations: Mapping[str, float | None]) -> tuple[Sta
     imitation = StackRow(IMITATION, IMITATION, (ON if scenario.imitation else OFF, _look(scenario, IMITATION)))
     base = StackRow(BASE, BASE, (SHOWN if BASE_PANEL in scenario.view.panels else SHOW,))
     return (*reversed(rows), imitation, base)
-
-
-def durations(frame: Frame) -> dict[str, float | None]:
-    """Return t of the flow of each transform, by name; None where it is off."""
-    layers = zip(frame.scenario.stack, frame.durations, strict=False)
-    return {**{layer.name: duration for layer, duration in layers}, WHOLE_ARM: frame.arm_duration}
 
 
 def legend_html(scenario: Scenario) -> str:
@@ -211,20 +197,9 @@ _ACTIONS: dict[str, Callable[[Scenario, str], dict[str, Any]]] = {
 def add_warp(gui: viser.GuiApi, bindings: Bindings, order: float) -> None:
     """Build the slider of the warp and the button that plays it, from an order in their folder on."""
     hint = "part of its time that each flow runs. 0: motions and space are straight; 1: the stack is complete"
-    slider = gui.add_slider(WARP, 0.0, 1.0, 0.01, 1.0, order=order, hint=hint)
-    bindings.field(slider, "warp")
-    buttons = gui.add_button_group("Play warp", (PLAY,), order=order + 1)
-
-    def show(playing: bool) -> None:
-        buttons.options = (STOP,) if playing else (PLAY,)
-
-    def press(session: Session, button: str) -> None:
-        if button == STOP:
-            player.stop(session)
-        else:
-            player.start(session, WARP, grown, show)
-
-    bindings.on(buttons, press)
+    bindings.field(gui.add_slider(WARP, 0.0, 1.0, 0.01, 1.0, order=order, hint=hint), "warp")
+    play = gui.add_button_group("Play warp", ("▶ 0 → 1",), order=order + 1)
+    bindings.plays(play, WARP, lambda _session, _button: grown)
 
 
 def grown(scenario: Scenario, seconds: float) -> dict[str, float] | None:
@@ -235,36 +210,30 @@ def grown(scenario: Scenario, seconds: float) -> dict[str, float] | None:
 def add_transform_settings(gui: viser.GuiApi, bindings: Bindings, order: float) -> None:
     """Build the settings of the transform that is chosen here, or was looked at last, from an order on."""
     which = gui.add_dropdown("Settings of", (IMITATION,), order=order, hint="the transform that is changed below")
-    bindings.properties(which, options=tunable)
-    bindings.input(which, tuned, lambda s, value: {"view": replace(s.view, tuned=value)})
+    bindings.input(which, tuned, lambda s, value: {"view": replace(s.view, tuned=value)}, options=tunable)
     order += 1
     hint = "what is fitted to the demonstrations: whole motions, or velocities as in eq. (3) of the paper"
     objective = gui.add_dropdown("Objective", OBJECTIVES, order=order, hint=hint)
-    bindings.field(objective, "objective")
+    bindings.field(objective, "objective", visible=_is_imitation)
     hint = (
         "plain: the paper's, one field that needs no memory. augmented: remembers its phase and where it began, so "
         "that it crosses itself, comes back, and draws the figure from other starts. auto: plain, unless it "
         "misses a demonstration, or clearly those that it has not learned from"
     )
-    state = gui.add_dropdown("State", STATES, order=order, hint=hint)
-    bindings.field(state, "state")
+    bindings.field(gui.add_dropdown("State", STATES, order=order, hint=hint), "state", visible=_is_imitation)
     hint = "how another hand draws, taken off its demonstrations of one letter and put on this one (augmented)"
-    style = gui.add_dropdown("Style", (NO_STYLE, *STYLES), order=order, hint=hint)
-    bindings.input(style, lambda s: s.style or NO_STYLE, lambda _s, name: {"style": "" if name == NO_STYLE else name})
+    bindings.input(
+        gui.add_dropdown("Style", (NO_STYLE, *STYLES), order=order, hint=hint),
+        lambda s: s.style or NO_STYLE,
+        lambda _s, name: {"style": "" if name == NO_STYLE else name},
+        visible=lambda s: _is_imitation(s) and bindings.frame is not None and bindings.frame.task.draws,
+    )
     hint = "part of the style that is put on; below 0 it is taken off"
     amount = gui.add_slider("Amount", -1.0, 2.0, 0.05, 1.0, order=order, hint=hint)
-    bindings.field(amount, "style_amount")
-    bindings.properties(style, visible=lambda s: _is_imitation(s) and _is_drawing(bindings.frame))
-    bindings.properties(amount, visible=lambda s: _is_imitation(s) and bool(s.style))
+    bindings.field(amount, "style_amount", visible=lambda s: _is_imitation(s) and bool(s.style))
     note = gui.add_html("", order=order)
-    bindings.properties(note, content=lambda _s: learned_html(bindings.frame))
-    for handle in (objective, state, note):
-        bindings.properties(handle, visible=_is_imitation)
+    bindings.properties(note, content=lambda _s: learned_html(bindings.frame), visible=_is_imitation)
     add_settings(gui, bindings, _settings, tuned, order)
-
-
-def _is_drawing(frame: Frame | None) -> bool:
-    return frame is not None and frame.task.draws
 
 
 def _is_imitation(scenario: Scenario) -> bool:

@@ -1,24 +1,33 @@
-"""The status: one line, one reason in a place of a fixed height, a button that mends it, and all details."""
+"""The status: a line of figures, the one reason against it that matters most, what mends that, and all details."""
 
 from __future__ import annotations
 
 import html
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
 
 import viser
 
 from dt_viz.avoidance.registry import entry_of
 from dt_viz.robot.collision import SELF_REACH, CollisionReport
 from dt_viz.scenario.paper_scenes import SCENES
-from dt_viz.scenario.scenario import View
+from dt_viz.scenario.scenario import Scenario, View
+from dt_viz.scenario.stack import (
+    WHOLE_ARM,
+    avoidance_layer,
+    avoiding_with,
+    transform_of,
+    with_avoidance,
+    with_transform,
+)
 from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.progress import Pace, Progress
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.scene.palette import Colour, ink, paper
 from dt_viz.ui.tabs.plots import small
-from dt_viz.ui.tabs.verdict import Verdict, concerns, remedy, shows_arm, verdict
-from dt_viz.warning import MotionWarning, Severity, in_millimetres
+from dt_viz.warning import ARM, Kind, Mend, MotionWarning, Severity, in_millimetres
 
 CHANGED = "The scene is changed. “Reset” brings it back as it was."
 COLOURS: Mapping[Severity | None, tuple[Colour, Colour]] = {
@@ -51,6 +60,137 @@ ROWS: Mapping[str, str] = {
     "is stable.",
 }
 """Rows of the details, with their tooltips."""
+COMPUTING = "computing …"
+HOLDS = (
+    "Every check holds: the motions clear the obstacles, space does not fold (det J > 0), the inverse is exact, and "
+    "the Lyapunov value falls along every motion."
+)
+WARP_HINT = "at warp {:.2f} each flow has run for that part of its time, so nothing is expected to be clear yet"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the status says."""
+
+    line: str
+    """One line of figures, such as "✓ safe · 9 mm · stable · 12 ms"."""
+    severity: Severity = Severity.GOOD
+    reason: str = ""
+    """The one reason that matters most, or that every check holds; empty while that is not known."""
+    busy: bool = False
+    """Whether something is being computed, so that the severity is not the last word."""
+
+
+FAILED = Verdict("✕ not computed", Severity.ALARM)
+"""Verdict where something has failed before all was known."""
+
+
+def verdict(progress: Progress) -> Verdict:
+    """Return the verdict on what is shown, as far as it is what is wanted."""
+    if progress.learning is not None:
+        return Verdict(f"learning the motion … {100 * progress.learning[0]:.0f} %", busy=True)
+    if progress.failed and not progress.complete:
+        return FAILED
+    frame, view = progress.shown, progress.wanted.view
+    if frame is None or progress.stale:
+        return Verdict(COMPUTING, busy=True)
+    known, latency = frame.certificates, progress.pace.latency
+    figures = () if frame.blocked else (_clearance_text(frame, view),)
+    if known.lyapunov_falls is not None:
+        figures += ("stable" if known.lyapunov_falls else "not stable",)
+    figures += (f"{1e3 * latency:.0f} ms" if latency < 1 else f"{latency:.1f} s",)
+    head, severity, reason = _judged(frame, concerns(frame, view))
+    if not progress.complete:
+        # a warning that is known stays in view; whether all checks hold is not known
+        head, reason = COMPUTING, "" if severity is Severity.GOOD else reason
+    return Verdict(" · ".join((head, *figures)), severity, reason, busy=not progress.complete)
+
+
+def _judged(frame: Frame, found: tuple[MotionWarning, ...]) -> tuple[str, Severity, str]:
+    if frame.blocked:
+        why = "; ".join(map(str, frame.blocked))
+        return "✕ no motion", Severity.ALARM, f"{why}. What is shown is the last good motion."
+    if frame.scenario.warp < 1:
+        return f"warp {frame.scenario.warp:.2f}", Severity.NOTE, WARP_HINT.format(frame.scenario.warp)
+    if not found:
+        return "✓ safe", Severity.GOOD, HOLDS
+    gravest, *others = found
+    concern = gravest.kind.concern
+    more = f" (and {len(others)} more: see Details)" if others else ""
+    mark = "✕" if concern.severity is Severity.ALARM else "⚠"
+    return f"{mark} {concern.value}", concern.severity, f"{gravest}{more}"
+
+
+def concerns(frame: Frame, view: View) -> tuple[MotionWarning, ...]:
+    """Return the warnings about a frame, the gravest first, without those about an arm that is hidden."""
+    known, scenario = frame.certificates, frame.scenario
+    hidden = not shows_arm(view)
+    found = [warning for warning in known.warnings if not (hidden and warning.source == ARM)]
+    of_motion = any(not warning.kind.of_meshes for warning in found)
+    if known.clearance < 0 and scenario.warp == 1 and not (of_motion or frame.blocked):
+        kind = Kind.ENTERS if clearance(frame, view) < 0 else Kind.TOO_NEAR
+        why = " at this flow time" if scenario.avoids else ": nothing avoids it"
+        found.append(MotionWarning(kind, f"the motions go through the obstacle{why}"))
+    if scenario.avoids and scenario.arm_avoidance is None:
+        hand = "only the path of the hand gives way"
+        found = [replace(w, text=f"{w.text}: {hand}") if w.kind is Kind.ARM_ENTERS else w for w in found]
+    return tuple(sorted(found, key=lambda warning: warning.kind.concern.gravity))
+
+
+def shows_arm(view: View) -> bool:
+    """Return whether an arm is drawn, so that something is to be said about it."""
+    return view.arm or view.onion
+
+
+def clearance(frame: Frame, view: View) -> float:
+    """Return the clearance of what is shown, metres: of the arm's meshes where it is known, or else of what avoids."""
+    known = frame.certificates
+    meshes = known.collision if shows_arm(view) else None
+    return known.clearance if meshes is None else meshes.obstacle.distance
+
+
+def _clearance_text(frame: Frame, view: View) -> str:
+    distance = clearance(frame, view)
+    return "no obstacle" if distance == float("inf") else f"{1e3 * distance:.0f} mm".replace("-", "−")
+
+
+@dataclass(frozen=True)
+class Remedy:
+    """An edit that mends something."""
+
+    label: str
+    """Label of its button."""
+    changes: Mapping[str, Any]
+    """Fields of the scenario that it replaces."""
+
+
+def remedy(frame: Frame, wanted: Scenario) -> Remedy | None:
+    """Return what mends the gravest problem of the newest frame; None if nothing does, or other motions are wanted."""
+    if frame.blocked or frame.scenario.choices != wanted.choices:
+        return None
+    if wanted.warp < 1:
+        return Remedy("Complete the warp", {"warp": 1.0})
+    found = concerns(frame, wanted.view)
+    return _against(found[0].kind.mend, found[0].source, wanted) if found else None
+
+
+def _against(mend: Mend | None, source: str, scenario: Scenario) -> Remedy | None:
+    whole, avoidance = scenario.view.arm, scenario.avoidance
+    enters = mend is Mend.WHOLE_ARM and scenario.arm_avoidance is None and whole
+    if enters or (mend is Mend.FLOW and not avoidance_layer(scenario).on):
+        label = "Let the whole arm avoid" if whole else "Let the hand avoid"
+        return Remedy(label, {"stack": avoiding_with(scenario, "cspace" if whole else "task")})
+    # what was chosen by hand is left to the automatic choice
+    if mend is Mend.FLOW and avoidance.duration is not None:
+        return Remedy("Choose the flow time automatically", {"stack": with_avoidance(scenario, duration=None)})
+    if mend is Mend.INTEGRATION or (mend is Mend.FLOW and avoidance.integration.by_hand):
+        name = source if mend is Mend.INTEGRATION else avoidance_layer(scenario).name
+        transform: Any = transform_of(scenario, name)
+        automatic = replace(transform, integration=replace(transform.integration, method="auto"))
+        return Remedy("Integrate automatically", {"stack": with_transform(scenario, name, automatic)})
+    if mend is Mend.FLOW and avoidance.generator == "probability":
+        return Remedy("Use the free-space generator", {"stack": with_avoidance(scenario, generator="free-space")})
+    return None
 
 
 def hint(frame: Frame) -> str:
@@ -111,7 +251,6 @@ def details_html(frame: Frame, pace: Pace, view: View) -> str:
 
 
 def _boxes(warnings: tuple[MotionWarning, ...], severity: Severity) -> str:
-    """Return warnings in boxes of their colour."""
     colour, background = COLOURS[severity]
     return "".join(
         "<div style='font-size:0.8em;margin:0.2em 0.9em 0.5em;padding:0.35em 0.6em;"
@@ -127,8 +266,10 @@ def _rows(frame: Frame, pace: Pace, view: View) -> Iterator[tuple[str, str]]:
     unknown = "–" if frame.blocked or frame.stage is Stage.CERTIFIED else "…"
     off = "–" if frame.blocked else "off"
     whole_arm = frame.scenario.arm_avoidance is not None
-    yield "Rebuild", _rebuild(pace)
-    yield "Clearance", off if frame.blocked else clearance_text(known.clearance, whole_arm=whole_arm)
+    rate = f" · {pace.rate:.0f} frames/s" if pace.rate > 1 else ""
+    yield "Rebuild", f"{1e3 * pace.latency:.0f} ms{rate} · {pace.num_skipped} skipped"
+    clearance = f"{1e3 * known.clearance:.1f} mm, {'body points' if whole_arm else 'end effector'}"
+    yield "Clearance", off if frame.blocked else "no obstacle" if known.clearance == float("inf") else clearance
     if shows_arm(view):
         yield from collision_rows(known.collision, unknown)
         if frame.has_orientation:
@@ -140,12 +281,6 @@ def _rows(frame: Frame, pace: Pace, view: View) -> Iterator[tuple[str, str]]:
     yield "Lyapunov value", {None: unknown, True: "falls", False: "does not fall"}[known.lyapunov_falls]
 
 
-def _rebuild(pace: Pace) -> str:
-    """Describe the speed of rebuilding."""
-    rate = f" · {pace.rate:.0f} frames/s" if pace.rate > 1 else ""
-    return f"{1e3 * pace.latency:.0f} ms{rate} · {pace.num_skipped} skipped"
-
-
 def error_text(length: float) -> str:
     """Format a length, metres, that should be zero: rounding is exact."""
     if length < 1e-12:  # metres
@@ -153,26 +288,18 @@ def error_text(length: float) -> str:
     return "< 0.001 mm" if length < 1e-6 else in_millimetres(length)
 
 
-def clearance_text(clearance: float, *, whole_arm: bool) -> str:
-    """Format a clearance, metres, and whose it is."""
-    whose = "body points" if whole_arm else "end effector"
-    return "no obstacle" if clearance == float("inf") else f"{1e3 * clearance:.1f} mm, {whose}"
-
-
-def _duration_rows(frame: Frame, off: str) -> tuple[tuple[str, str], ...]:
-    """Return the rows with t of the flows: of the avoidance, and of the transforms that call it otherwise."""
-    hand, strengths = None, []
-    for layer, duration in zip(frame.scenario.stack, frame.durations, strict=False):
-        if duration is None:
-            continue
-        if entry_of(layer.transform).most == 1:
-            hand = duration
-        else:
-            strengths.append(f"{duration:.2f} {layer.name}")
-    flow_time = hand if frame.arm_duration is None else frame.arm_duration
-    shown = off if flow_time is None else f"{flow_time:.2f}"
-    times = () if flow_time is None and strengths else (("Flow time t", shown),)
-    return (*times, *((("Strength", " · ".join(strengths)),) if strengths else ()))
+def _duration_rows(frame: Frame, off: str) -> Iterator[tuple[str, str]]:
+    """Yield the rows with t of the flows: of the avoidance, and of the transforms that call it otherwise."""
+    strengths, times, flow_time = [], frame.durations, frame.durations.get(WHOLE_ARM)
+    for layer in frame.scenario.stack:
+        if layer.name in times and entry_of(layer.transform).most > 1:
+            strengths.append(f"{times[layer.name]:.2f} {layer.name}")
+        elif flow_time is None:
+            flow_time = times.get(layer.name)
+    if flow_time is not None or not strengths:
+        yield "Flow time t", off if flow_time is None else f"{flow_time:.2f}"
+    if strengths:
+        yield "Strength", " · ".join(strengths)
 
 
 def collision_rows(report: CollisionReport | None, unknown: str) -> tuple[tuple[str, str], ...]:

@@ -19,17 +19,9 @@ from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, MeshObstacle, 
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.inverse_kinematics import UnreachableError
 from dt_viz.scenario.scenario import MAX_DIAMETER, MAX_MARGIN, MAX_OBSTACLES, MIN_DIAMETER, Scenario
-from dt_viz.scenario.stack import (
-    added,
-    selected,
-    surroundings,
-    with_added,
-    with_avoidance,
-    without,
-)
+from dt_viz.scenario.stack import added, selected, surroundings, with_added, with_avoidance, without
 from dt_viz.scenario.starts import followed, label_of, with_grid, with_label
 from dt_viz.scenario.tasks import Task
-from dt_viz.session.frame import Frame
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import KEEP, Bindings
 from dt_viz.ui.tabs.from_file import ORIGIN, FileLoader, has_room
@@ -86,8 +78,7 @@ class _Length:
             return {"stack": with_avoidance(scenario, obstacles=changed)}
 
         slider = gui.add_slider(self.label, 100 * self.low, 100 * self.high, 0.5, 15.0, hint=self.hint)
-        bindings.properties(slider, visible=lambda s: isinstance(_selected(s), self.shape))
-        bindings.input(slider, shown, changed)
+        bindings.input(slider, shown, changed, visible=lambda s: isinstance(_selected(s), self.shape))
 
     def _with(self, obstacle: Any, length: float) -> Obstacle:  # noqa: ANN401 - of the shape
         if isinstance(obstacle, MeshObstacle | CloudObstacle):
@@ -121,20 +112,19 @@ def add_obstacles(gui: viser.GuiApi, bindings: Bindings) -> FileLoader:
     with gui.add_folder("Obstacles"):
         hint = "the obstacle that is changed here; a click in the scene selects one, too"
         choice = gui.add_dropdown("Selected", (NONE,), hint=hint)
-        bindings.properties(choice, options=_names)
         bindings.input(
             choice,
             lambda s: _names(s)[s.selected or 0],
             lambda s, name: {"view": replace(s.view, selected=choice.options.index(name))},
+            options=_names,
         )
         bindings.checkbox(gui, "handles")
         group = gui.add_button_group("Add", tuple(SHAPES), hint=f"up to {MAX_OBSTACLES}, where there is room")
-        bindings.properties(group, visible=has_room)  # groups of buttons cannot be disabled
-        bindings.later(group, lambda session, name: add(session, SHAPES[name]))
+        # groups of buttons cannot be disabled
+        bindings.later(group, lambda session, name: add(session, SHAPES[name]), visible=has_room)
         changes = {"Duplicate": duplicate, "Delete": delete}
         change = gui.add_button_group("Change", tuple(changes), hint="the selected obstacle")
-        bindings.properties(change, visible=lambda s: bool(s.obstacles))
-        bindings.later(change, lambda session, name: changes[name](session))
+        bindings.later(change, lambda session, name: changes[name](session), visible=lambda s: bool(s.obstacles))
         for length in LENGTHS:
             length.add(gui, bindings)
         hint = "clearance that the automatic flow time keeps"
@@ -168,13 +158,11 @@ def delete(session: Session) -> None:
 
 
 def _replace(session: Session, obstacles: tuple[Obstacle, ...], selected: int) -> None:
-    """Replace the obstacles, as one step for undo."""
     view = replace(session.scenario.view, selected=selected)
     session.step("obstacles", stack=with_avoidance(session.scenario, obstacles=obstacles), view=view)
 
 
 def _names(scenario: Scenario) -> tuple[str, ...]:
-    """Return the numbers and shapes of the obstacles."""
     return tuple(f"{k}: {name_of(obstacle)}" for k, obstacle in enumerate(scenario.obstacles, 1)) or (NONE,)
 
 
@@ -210,20 +198,18 @@ def add_transforms(gui: viser.GuiApi, bindings: Bindings) -> None:
         hinted = ((title, registry.KINDS[kind].hint) for title, kind in kinds.items())
         hints = "; ".join(f"{title}: {hint}" for title, hint in hinted if hint)
         buttons = gui.add_button_group("Add", tuple(kinds), hint=hints)
-        bindings.properties(buttons, options=lambda s: _offered(s) or KEEP, visible=lambda s: bool(_offered(s)))
-        bindings.later(buttons, lambda session, title: add_transform(session, kinds[title]))
+        offered = {"options": lambda s: _offered(s) or KEEP, "visible": lambda s: bool(_offered(s))}
+        bindings.later(buttons, lambda session, title: add_transform(session, kinds[title]), **offered)
         buttons = gui.add_button_group("Change", ("Delete",), visible=False, hint="the selected transform")
-        bindings.properties(buttons, visible=lambda s: bool(added(s)))
-        bindings.later(buttons, lambda session, _delete: delete_transform(session))
-        which = gui.add_dropdown("Selected", (NO_TRANSFORM,), visible=False)
-        bindings.properties(
-            which, options=lambda s: tuple(added(s)) or (NO_TRANSFORM,), visible=lambda s: len(added(s)) > 1
-        )
+        bindings.later(buttons, lambda session, _name: delete_transform(session), visible=lambda s: bool(added(s)))
         bindings.input(
-            which, lambda s: selected(s) or NO_TRANSFORM, lambda s, value: {"view": replace(s.view, bias=value)}
+            gui.add_dropdown("Selected", (NO_TRANSFORM,), visible=False),
+            lambda s: selected(s) or NO_TRANSFORM,
+            lambda s, value: {"view": replace(s.view, bias=value)},
+            options=lambda s: tuple(added(s)) or (NO_TRANSFORM,),
+            visible=lambda s: len(added(s)) > 1,
         )
-        handles = bindings.checkbox(gui, "bias_handles", visible=False).handle
-        bindings.properties(handles, visible=lambda s: bool(added(s)))
+        bindings.checkbox(gui, "bias_handles", visible=lambda s: bool(added(s)))
         add_settings(gui, bindings, lambda entry: settings_of_purpose(entry) if entry.most > 1 else (), selected)
 
 
@@ -258,19 +244,36 @@ def add_starts(gui: viser.GuiApi, bindings: Bindings) -> None:
     """Build the folder "Starts": adds starts by clicks and in a grid, labels and removes them."""
     with gui.add_folder("Starts", expand_by_default=False):
         bindings.checkbox(gui, "click_to_start")
-        label = gui.add_dropdown("Label", (NEAREST,), initial_value=NEAREST, hint=LABEL_HINT)
-        labels = partial(_labels, bindings)
-        bindings.properties(label, options=lambda _s: (NEAREST, *labels()), visible=lambda _s: bool(labels()))
-        bindings.input(
-            label,
-            lambda s: _label_shown(s, bindings.frame),
-            lambda s, name: _labelled(s, bindings.session.task, labels().get(name)),
-        )
+        _add_label(gui, bindings)
         acts = {"Grid": add_grid, "Remove": remove_start, "Clear": clear_starts}
         hint = "Grid: starts all over the slice. Remove: the start that the arm follows, or else the newest"
-        bindings.later(
-            gui.add_button_group("Starts", tuple(acts), hint=hint), lambda session, name: acts[name](session)
-        )
+        buttons = gui.add_button_group("Starts", tuple(acts), hint=hint)
+        bindings.later(buttons, lambda session, name: acts[name](session))
+
+
+def _add_label(gui: viser.GuiApi, bindings: Bindings) -> None:
+    """Build the choice of the label that new starts, and the added start that the arm follows, get."""
+
+    def names() -> dict[float | None, str]:
+        labels = () if bindings.frame is None else bindings.frame.labels
+        return {None: NEAREST} | {label: _named(label, labels) for label in sorted(set(labels))}
+
+    def shown(scenario: Scenario) -> str:
+        label = None if bindings.frame is None else label_of(scenario, bindings.frame.task)
+        return names().get(label, NEAREST)
+
+    def changed(scenario: Scenario, name: str) -> dict[str, Any]:
+        label = next((label for label, known in names().items() if known == name), None)
+        starts = with_label(scenario, bindings.session.task, label)
+        return {"starts": starts, "view": replace(scenario.view, start_label=label)}
+
+    bindings.input(
+        gui.add_dropdown("Label", (NEAREST,), initial_value=NEAREST, hint=LABEL_HINT),
+        shown,
+        changed,
+        options=lambda _s: tuple(names().values()),
+        visible=lambda _s: len(names()) > 1,
+    )
 
 
 def add_grid(session: Session) -> None:
@@ -308,28 +311,6 @@ def clear_starts(session: Session) -> None:
     """Remove all added starts."""
     place = followed(session.scenario, session.task)
     session.step("clear starts", starts=(), arm_rollout=place if place < len(session.task.starts) else 0)
-
-
-def _labelled(scenario: Scenario, task: Task, label: float | None) -> dict[str, Any]:
-    """What changes when new starts, and the added start that the arm follows, get a label."""
-    starts = with_label(scenario, task, label)
-    return {"starts": starts, "view": replace(scenario.view, start_label=label)}
-
-
-def _labels(bindings: Bindings) -> dict[str, float]:
-    """The labels of the frame that is shown, by their names."""
-    if bindings.frame is None:
-        return {}
-    labels = bindings.frame.labels
-    return {_named(label, labels): label for label in sorted(set(labels))}
-
-
-def _label_shown(scenario: Scenario, frame: Frame | None) -> str:
-    """The name of the label that starts of the scenario have in a frame."""
-    if frame is None:
-        return NEAREST
-    label = label_of(scenario, frame.task)
-    return NEAREST if label is None or label not in frame.labels else _named(label, frame.labels)
 
 
 def _named(label: float, labels: Sequence[float]) -> str:

@@ -1,18 +1,37 @@
-"""Several files at once, chosen or dropped, for an upload button of viser, which sends one.
+"""Scripts on the page, beside viser's own: one sends several files at once, one tells how wide the window is.
 
-A script on the page packs them into one zip archive, without compression, and gives that to the button. Where scripts
-are not run, the button takes one file after another as it always does.
+An upload button of viser sends one file. So files that are chosen or dropped together are packed into one zip archive,
+without compression. Where scripts are not run, the button takes one file after another as it always does.
+
+viser's page reports the size of its canvas in the pixels that it is drawn with: device pixels, at most two for each CSS
+pixel at first, and fewer where drawing is slow. What lies beside the canvas, such as the panel, is measured in CSS
+pixels. So the page asks for an address that has the width in it, again whenever that changes.
 """
 
 from __future__ import annotations
 
 import html
+import re
+import secrets
+from collections.abc import Callable
 
 import viser
 
 from dt_viz.ui import patches
 
-SCRIPT = """
+FOLDER = "window"
+NARROWEST, WIDEST = 240, 20_000
+"""Widths that a window can have, CSS pixels."""
+MEASURE = """
+clearTimeout(window.dtVizTells);
+removeEventListener('resize', window.dtVizResized);
+const tell = () => fetch('ADDRESS/' + innerWidth, {cache: 'no-store'});
+window.dtVizResized = () => { clearTimeout(window.dtVizTells); window.dtVizTells = setTimeout(tell, 200); };
+addEventListener('resize', window.dtVizResized);
+tell();
+"""
+"""Tells the width; ADDRESS is what is asked for."""
+DROP = """
 const input = document.getElementById('file_upload_' + BUTTON);
 if (!input || input.multiple) return;
 const table = Array.from({length: 256}, (_, n) => {
@@ -92,10 +111,36 @@ window.dtVizForget = () => {
   document.removeEventListener('drop', drop);
 };
 """
-"""What the page does: BUTTON is the button's name in it, MOST the largest number of bytes of a file."""
+"""Sends files; BUTTON is the button's name in the page, MOST the largest number of bytes of a file."""
+
+Measured = Callable[[str, float], None]
+"""Callback that takes the token of a ruler, and the width of its window, CSS pixels."""
+
+
+class Ruler:
+    """Measures the window of one visitor."""
+
+    def __init__(self) -> None:
+        self.token = secrets.token_urlsafe(12)
+        """Name of this ruler in requests, which nobody else knows."""
+
+    @property
+    def html(self) -> str:
+        """What is to stand on the page, unseen."""
+        return _run(MEASURE.replace("ADDRESS", f"{FOLDER}/{self.token}"))
+
+
+def told(path: str) -> tuple[str, float] | None:
+    """Return the token and the width, CSS pixels, that the path of a request tells; None if it is another request."""
+    found = re.search(rf"/{FOLDER}/([\w-]+)/(\d{{3,5}})$", path, re.ASCII)
+    return (found[1], float(found[2])) if found and NARROWEST <= int(found[2]) <= WIDEST else None
 
 
 def drop_html(button: viser.GuiUploadButtonHandle, most: int) -> str:
     """Return what is to stand beside an upload button on the page, unseen; files are of so many bytes at most."""
-    script = SCRIPT.replace("BUTTON", repr(patches.name_of(button))).replace("MOST", str(most))
+    return _run(DROP.replace("BUTTON", repr(patches.name_of(button))).replace("MOST", str(most)))
+
+
+def _run(script: str) -> str:
+    """Return what runs a script where it is on the page, and is not seen."""
     return f'<img src="data:," alt="" hidden onerror="{html.escape(f"(() => {{{script}}})()")}">'
