@@ -236,10 +236,10 @@ class Follower:
         known, clearance = self._with_room(learned, obstacle, margin)
         free = clearance >= 0
         left = ~known.alike(0) if is_ample else np.ones(len(free), bool)
-        # the goal first, then as many starts as possible, then as much room there, to the millimetre about
+        # the goal first, then as many starts as possible, then as much room there, to a tenth of what is asked for
         most = free[:, -1] * free.shape[1] + free.sum(axis=1)
         kept = np.array([_as_posture(posture) == last for posture in known.references])
-        least = np.floor(30 * np.where(free, clearance, np.inf).min(axis=1) / self._enough(margin))
+        least = np.floor(10 * np.where(free, clearance, margin).min(axis=1) / max(margin, 1e-9))
         for best in np.lexsort((known.cost(obstacle, margin, most == most.max()), -least, ~kept, -most)):
             if left[best]:
                 left &= ~known.alike(int(best))
@@ -247,16 +247,12 @@ class Follower:
 
     def _with_room(self, learned: Learned, obstacle: Union, margin: float) -> tuple[ReferencePostures, Array]:
         """Reference postures, and their room (K, R + 1), metres: more where none has enough, but some might have it."""
-        enough, known = self._enough(margin), self.reference_postures(learned)
-        room = known.room(obstacle, enough)
-        if (room >= enough).all(axis=1).any() or obstacle.signed_distance(learned.demonstrated.ends).min() < margin:
+        known = self.reference_postures(learned)
+        room = known.room(obstacle, margin)
+        if (room >= margin).all(axis=1).any() or obstacle.signed_distance(learned.demonstrated.ends).min() < margin:
             return known, room
         more = self.reference_postures(learned, MOST_LOTS).clear_of(obstacle)
-        return (more, more.room(obstacle, enough)) if len(more.references) > 1 else (known, room)
-
-    def _enough(self, margin: float) -> float:
-        """Room, metres, from which motions keep the margin also where starts and goal hold them back."""
-        return margin + self.whole_arm.settings.pin
+        return (more, more.room(obstacle, margin)) if len(more.references) > 1 else (known, room)
 
     def reference_postures(self, learned: Learned, num_lots: int = 1) -> ReferencePostures:
         """The reference postures for a task's motions, a second's work the first time; raises as `reference`."""
