@@ -162,5 +162,6 @@ def test_a_planner_that_knows_nothing_of_ours_tells_whether_there_is_a_way(small
 def test_an_arm_passes_a_ball_that_leaves_its_starts_little_room(fits, task, place, diameter):
     """All starts are 2 to 6 cm from the ball, which none of the usual postures keeps clear of at all of them."""
     arm = load_arm("z1")
-    found = measured(Engine(in_reach(TASKS, arm), fits, arm), TASKS[task](), ArmAvoidance(Sphere(place, diameter)))
-    assert len(found.rollouts) == len(found.ends) - 1 and found.clearance > 0.009
+    engine = Engine(in_reach(TASKS, arm), fits, arm)
+    found = measured(engine, engine.task(task), ArmAvoidance(Sphere(place, diameter)))
+    assert len(found.motions) == len(found.ends) - 1 and found.clearance > 0.009
