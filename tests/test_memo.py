@@ -53,7 +53,9 @@ def test_two_threads_that_compute_a_result_at_once_get_the_same_one():
 
 def test_engines_that_share_what_is_learned_and_postures_compute_them_once(fits, robot, initial, monkeypatch):
     made, reference_postures = [], following.reference_postures
-    monkeypatch.setattr(following, "reference_postures", lambda *given: made.append(1) or reference_postures(*given))
+    monkeypatch.setattr(
+        following, "reference_postures", lambda *given: made.append(given[-1]) or reference_postures(*given)
+    )
     shared, scenario = Memo(), initial("push_box")
     x, y, z = scenario.obstacles[0].position
     beside = changed(scenario, obstacles=scenario.obstacles[0].moved((x - 0.1, y, z)), space="cspace")
@@ -61,7 +63,7 @@ def test_engines_that_share_what_is_learned_and_postures_compute_them_once(fits,
     learned = {id(engine.nominal(beside).learned) for engine in engines}
     for engine in engines:
         list(engine.follower.alternatives(engine.nominal(beside), beside.arm_avoidance))
-    assert len(learned) == len(made) == 1
+    assert len(learned) == 1 and len(made) == len(set(made)) > 0  # each number of lots once
 
 
 class Blank:

@@ -26,6 +26,8 @@ from dt_viz.kernels.blocks import room_asked
 from dt_viz.robot.body_points import BodyPoints
 from dt_viz.robot.robot import Robot
 
+LEAST_PIN = 0.25
+"""Least size of the region around a pinned posture in which the field fades out, in that of the settings."""
 NUM_COARSE = 40
 """Number of samples of each rollout of coarse motions, before refinement."""
 MAX_DURATION = 2.0
@@ -110,12 +112,13 @@ class Solver:
         self._lifted = lifted
         self._avoidance = avoidance
         self._detours = tuple(detours)
-        self._generator = self._generated([detour for detour in detours if detour is not None])
         self._spacing = spacing
-        self._coarse = coarse and self._generator is not None
         self._between = between
         self._margin = max(float(avoidance.margin), 2 * ROUNDING)
-        self._room = body.clearance(robot, lifted.pins, avoidance.avoided, self._margin + ROUNDING) - ROUNDING
+        enough = self._margin + max(self._settings.pin, ROUNDING)
+        self._room = body.clearance(robot, lifted.pins, avoidance.avoided, enough) - ROUNDING
+        self._generator = self._generated([detour for detour in detours if detour is not None])
+        self._coarse = coarse and self._generator is not None
 
     @cached_property
     def _settings(self) -> WholeArmSettings:
@@ -131,7 +134,11 @@ class Solver:
             return GradientField(self._robot, self._body, obstacles, reach)
         pins = self._limits.forward(self._limits.inside(self._lifted.pins))
         directions = np.stack([detour.direction for detour in met])
-        return WholeArmField(self._robot, self._body, obstacles, directions, pins, reach)
+        # where starts or goal have little room, motions keep away from what is beside them the sooner
+        pin = float(
+            np.clip(self._room.min() + ROUNDING - self._margin, LEAST_PIN * self._settings.pin, self._settings.pin)
+        )
+        return WholeArmField(self._robot, self._body, obstacles, directions, pins, reach, pin)
 
     def solution(self) -> ArmSolution:
         """Find the motions: with `auto`, after the shortest duration that clears them."""

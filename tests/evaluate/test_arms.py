@@ -153,3 +153,14 @@ def test_a_planner_that_knows_nothing_of_ours_tells_whether_there_is_a_way(small
     assert postures is not None and has_way(small, ball, 0.01, postures, few)
     walls = Sphere(ball.position, 4 * np.linalg.norm(ends[-1] - ends[0]))
     assert not has_way(small, walls, 0.01, postures, replace(few, seconds=0.3))
+
+
+@pytest.mark.parametrize(
+    ("task", "place", "diameter"),
+    [("draw_s", (0.0257, -0.4735, 0.5184), 0.142), ("draw_z", (-0.0691, -0.4486, 0.56), 0.0577)],
+)
+def test_an_arm_passes_a_ball_that_leaves_its_starts_little_room(fits, task, place, diameter):
+    """All starts are 2 to 6 cm from the ball, which none of the usual postures keeps clear of at all of them."""
+    arm = load_arm("z1")
+    found = measured(Engine(in_reach(TASKS, arm), fits, arm), TASKS[task](), ArmAvoidance(Sphere(place, diameter)))
+    assert len(found.rollouts) == len(found.ends) - 1 and found.clearance > 0.009
