@@ -122,12 +122,14 @@ def dodge(
     for first in range(0, len(q), AT_ONCE):
         last, base = min(first + AT_ONCE, len(q)), chosen.copy()
         for number in range(3 ** (last - first)):
-            tried[:] = base
+            for i in range(len(q)):
+                tried[i] = base[i]
             for i in range(first, last):
                 tried[i] = (number // 3 ** (i - first) % 3 - 1) * arm.fastest[i]
             left = _room(arm, forecast, q, velocity, tried, most)
             nearer = ((tried - wanted) ** 2).sum() < ((chosen - wanted) ** 2).sum()
             if left > most or (left == most and nearer):
                 most = left
-                chosen[:] = tried
+                for i in range(len(q)):
+                    chosen[i] = tried[i]
     return False, chosen

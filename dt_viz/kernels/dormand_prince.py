@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dt_viz.kernels.compiled import compiled, inlined
-from dt_viz.kernels.runge_kutta import Array, Field, Rate, Rows, Work, add, carry_in_steps, largest, moving, rates
+from dt_viz.kernels.runge_kutta import Array, Field, Rate, Rows, Work, add, carry_in_steps, copy, largest, moving, rates
 
 STAGES = np.array(
     [
@@ -93,7 +93,7 @@ def carry_explicitly(
     """Carry states (N, m) along, in place, by one of the methods above; see `dt_viz.kernels.flows.carry`."""
     first, num_failed = rates(rate, field, states, d, lanes, work), 0
     if method == RATE:
-        states[:] = first
+        copy(first, first.shape[1], states)
     elif method == DORMAND_PRINCE:
         num_failed = _carry_adaptively(rate, field, states, first, d, duration, tolerance, steps, lanes, work)
     else:

@@ -159,7 +159,10 @@ def _hold(escape: Escape, block: Record) -> None:
     upright = np.sqrt(escape.direction_weight / (axis[0] ** 2 + axis[1] ** 2 + axis[2] ** 2))
     for column, weight, offset in ((0, staying, hand), (3, upright, axis)):
         put(offset, n - 1, block)
-        tip[:], scale[:] = place, weight
+        scale[:] = weight
+        for c in range(3):
+            for lane in range(LANES):
+                tip[c, lane] = place[c, lane]
         for i in range(n):
             about = i if column == 0 else n - 1  # the direction is that from the last joint
             for c in range(3):

@@ -13,7 +13,7 @@ from dt_viz.kernels.compiled import compiled, inlined, kernel
 from dt_viz.kernels.dormand_prince import carry_explicitly
 from dt_viz.kernels.fields import FieldWork, Terms, field_work, velocity
 from dt_viz.kernels.gaussians import LANES, Array
-from dt_viz.kernels.runge_kutta import add, load, moving, rates, store
+from dt_viz.kernels.runge_kutta import add, copy, load, moving, rates, store
 
 IMPLICIT_EULER = 4
 """A method beside those of `dt_viz.kernels.dormand_prince`."""
@@ -105,7 +105,7 @@ def _implicit_euler(
     s, y, inverse, change = states[:d], memory[0, :d], memory[2:5], memory[8, :d]
     scale = 1 + np.abs(s[:, :n]).max()
     if begun:
-        y[:] = s
+        copy(s, n, y)
         for i in range(d):
             for j in range(d):
                 factor, source, into = inverse[i, j], change[j], y[i]
@@ -123,10 +123,10 @@ def _implicit_euler(
     if len(states) > d:
         _invert(h, velocity(field, y, n, both, work)[1], n, inverse)
         tangents = memory[1, : len(states)]
-        tangents[:] = states
+        copy(states, n, tangents)
         _multiply(inverse, tangents, n, d, states)
     add(-1.0, s, y, n, change)
-    s[:] = y
+    copy(y, n, s)
 
 
 @inlined

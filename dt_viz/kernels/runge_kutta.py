@@ -49,6 +49,15 @@ def add(factor: float, values: Array, start: Array, n: int, into: Array) -> None
 
 
 @compiled
+def copy(values: Array, n: int, into: Array) -> None:
+    """Write n lanes (m, L), with less to compile than an assignment of slices, which compares shapes."""
+    for i in range(len(into)):
+        row, end = values[i], into[i]
+        for p in range(n):
+            end[p] = row[p]
+
+
+@compiled
 def any_moves(rates: Array, n: int) -> bool:
     """Return whether one of n lanes (m, L) is not zero."""
     for i in range(len(rates)):
@@ -127,7 +136,7 @@ def carry_in_steps(
                         total[i, p] += weight * k[i, p]
                         there[i, p] = start[i, p] + ahead * k[i, p]
             add(1.0, total, start, n, start)
-            there[:] = start
+            copy(start, n, there)
             if not any_moves(k, n):
                 break
         store(start, rows, begin, n, states)

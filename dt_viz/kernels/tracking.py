@@ -126,7 +126,8 @@ def _newton(arm: TrackingArm, gain: float, turns: bool, block: Record) -> None:
     for lane in range(LANES):
         squared = error[0, lane] ** 2 + error[1, lane] ** 2 + error[2, lane] ** 2
         caution[lane] = np.sqrt(squared)
-    damping[:], multipliers[:] = arm.damping_floor, 0
+    damping[:] = arm.damping_floor
+    multipliers[:] = 0
     for i in range(n):
         for lane in range(LANES):
             multipliers[0, lane] += J[i, 0, lane] * p[i, lane]
