@@ -43,6 +43,10 @@ NUM_PLACES, MAX_WAITING = 2, 8
 class Client(ProtocolClient):
     """A visitor who also sends files."""
 
+    async def __aenter__(self):
+        await super().__aenter__()
+        return self
+
     async def upload(self, name: str, content: bytes, *, announced: int | None = None, transfer: str = "0") -> None:
         """Send a file with the upload button; its announced size is the true one if None."""
         size = len(content) if announced is None else announced
