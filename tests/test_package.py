@@ -19,7 +19,7 @@ from PIL import Image
 from dt_viz.ui.scene.palette import LIGHT
 
 ROOT = Path(__file__).parents[1]
-PATIENCE = 300.0
+PATIENCE = 900.0
 """Seconds that anything may take: the machine may be busy."""
 EVERYTHING = """
 import pkgutil, dt_viz
