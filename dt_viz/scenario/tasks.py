@@ -134,8 +134,8 @@ class TaskEntry:
 
     title: str
     load: Callable[[], Task]
-    is_fixed: bool = False
-    """Whether it stays where it was recorded, whatever the arm."""
+    is_recorded: bool = False
+    """Whether it was recorded in space: it stays there while an arm follows it there."""
 
     def __call__(self) -> Task:
         """The task, loaded on first use; all threads get the same one."""

@@ -49,7 +49,7 @@ class ArmStore:
 
         def load() -> _Workplace:
             robot = load_aside(name, progress)
-            return robot, in_reach(self._tasks, robot), Memo()
+            return robot, in_reach(self._tasks, robot, moves_recorded=True), Memo()
 
         robot, tasks, shared = self._memo("arm", name, load, newest=NUM_LOADED) if name else self._first
         return Engine(tasks, self._fits, robot, shared)

@@ -32,6 +32,7 @@ from dt_viz.session.cores import Cores
 from dt_viz.session.drawing import Drawing, arm_along, rollouts_of
 from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.robot_loop import LiveArm
+from dt_viz.session.tasks_in_reach import where_followed
 from dt_viz.warning import MotionWarning
 
 MOST_OWN = 4
@@ -66,8 +67,9 @@ class Engine:
         self._drawing = Drawing(self.follower, self.memo)
         self._last: dict[str, Solved] = {}
         """The last motion of each task: what is shown where a scenario has none."""
-        self.own: dict[str, tuple[Task, FitStore]] = {}
-        """The visitor's own tasks by name, the oldest first, and what was learned from each, for all of the engines."""
+        self.own: dict[str, tuple[Task, FitStore, Robot]] = {}
+        """The visitor's own tasks by name, the oldest first, what was learned from each, and the arm with which it was
+        opened; for all of the engines."""
 
     def title(self, name: str) -> str:
         """Title of the task of that name."""
@@ -79,7 +81,13 @@ class Engine:
         Raises:
             DemonstrationError: its file cannot be used.
         """
-        return self.own[name][0] if name in self.own else self._tasks[name]()
+        return self._own_task(name) if name in self.own else self._tasks[name]()
+
+    @kept(MOST_OWN)
+    def _own_task(self, name: str) -> Task:
+        task, _, opened_with = self.own[name]
+        robot = self.follower.robot
+        return task if robot is opened_with else where_followed(task, robot)
 
     def bring(self, task: Task, shown: str) -> tuple[Task, str | None]:
         """Take a task of the visitor's own, while another one is `shown`, which stays.
@@ -90,7 +98,7 @@ class Engine:
         number = max((int(name.rpartition("_")[2]) for name in self.own), default=0) + 1
         task = replace(task, name=f"{OWN}_{number}", title=f"Your data {number}" if number > 1 else "Your data")
         oldest = next((name for name in self.own if name != shown), None) if len(self.own) >= MOST_OWN else None
-        self.own[task.name] = task, FitStore(None)
+        self.own[task.name] = task, FitStore(None), self.follower.robot
         if oldest is not None:
             del self.own[oldest]
         return task, oldest

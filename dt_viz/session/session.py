@@ -19,7 +19,7 @@ from dt_viz.scenario.paper_scenes import SCENES
 from dt_viz.scenario.relocation import relocated
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import IMITATION, as_fresh
-from dt_viz.scenario.tasks import Task
+from dt_viz.scenario.tasks import OWN, Task
 from dt_viz.session.arms import Engines, NewEngine
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Frame, Stage
@@ -195,10 +195,15 @@ class Session:
             there = replace(there, stack=scene.scenario(after).stack)
         changes = ("scene", "stack", "starts", "view", "arm_rollout")
         self.step("arm", anew=True, arm=name, **{field: getattr(there, field) for field in changes})
-        if gone:
-            self.say(
-                f"Out of reach of the {engine.follower.robot.title}, and left out: {', '.join(gone)}.", Severity.NOTE
+        arm, said = engine.follower.robot.title, []
+        if self.scenario.task.startswith(OWN) and (after.scale, *after.origin) != (before.scale, *before.origin):
+            said.append(
+                f"“{after.title}” is moved to where the {arm} follows it, {after.scale / before.scale:.2g} × as large."
             )
+        if gone:
+            said.append(f"Out of reach of the {arm}, and left out: {', '.join(gone)}.")
+        if said:
+            self.say(" ".join(said), Severity.NOTE)
 
     def reset(self) -> None:
         """Back to how the task or the scene began, and was looked at; the motion's part of it can be undone."""

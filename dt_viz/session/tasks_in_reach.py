@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
@@ -14,28 +13,35 @@ from dt_viz.numerics import unit
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.inverse_kinematics import UnreachableError, inverse_kinematics
-from dt_viz.robot.placement import is_jaco, place
+from dt_viz.robot.placement import PlacementSettings, follows, is_jaco, place, resampled
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.tasks import Task, TaskEntry
 
 logger = logging.getLogger(__name__)
 
 
-def in_reach(tasks: Mapping[str, TaskEntry], robot: Robot) -> Mapping[str, TaskEntry]:
+def in_reach(tasks: Mapping[str, TaskEntry], robot: Robot, *, moves_recorded: bool = False) -> Mapping[str, TaskEntry]:
     """Return tasks made for the JACO, each placed where another arm follows it when it is chosen first.
 
     One that the arm can follow nowhere stays where it is: a log line says why, and the page what is out of reach.
+    Those recorded in space stay where they are, or, if `moves_recorded`, where the arm follows them there.
     """
-    if is_jaco(robot):
-        return tasks
-    return {
-        name: entry if entry.is_fixed else replace(entry, load=partial(_placed, entry, robot))
-        for name, entry in tasks.items()
-    }
+
+    def placed(entry: TaskEntry) -> TaskEntry:
+        if entry.is_recorded:
+            return replace(entry, load=lambda: where_followed(entry(), robot)) if moves_recorded else entry
+        return entry if is_jaco(robot) else replace(entry, load=lambda: _placed(entry(), robot))
+
+    return {name: placed(entry) for name, entry in tasks.items()}
 
 
-def _placed(entry: TaskEntry, robot: Robot) -> Task:
-    task = entry()
+def where_followed(task: Task, robot: Robot) -> Task:
+    """Return a task where it was recorded if the arm follows it there, or else placed in its reach."""
+    paths = np.array([resampled(path, PlacementSettings.num_samples) for path in task.paths])
+    return task if follows(robot, paths) else _placed(task, robot)
+
+
+def _placed(task: Task, robot: Robot) -> Task:
     reason: UnreachableError | None = None
     for on_table in (True, False) if task.on_table else (False,):
         try:
@@ -44,7 +50,7 @@ def _placed(entry: TaskEntry, robot: Robot) -> Task:
             return _freed(placed, robot) if task.on_table else placed
         except UnreachableError as error:
             reason = error
-    logger.warning("%s: %s", entry.title, reason)
+    logger.warning("%s: %s", task.title, reason)
     return task
 
 

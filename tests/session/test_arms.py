@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from arm_files import urdf, write
-from other_arms import seven_joints
+from other_arms import seven_joints, shorter
 from pages import NoFrames
 from scenes import avoiding
 
@@ -19,6 +19,7 @@ from dt_viz.memo import Memo
 from dt_viz.obstacles.shapes import Box, Cylinder, Sphere
 from dt_viz.robot import making, models
 from dt_viz.robot.models import ARMS, NotStoredError, load_arm
+from dt_viz.robot.placement import follows, resampled
 from dt_viz.robot.urdf import ArmError
 from dt_viz.scenario.paper_scenes import SCENES
 from dt_viz.scenario.relocation import Relocation, relocated
@@ -200,16 +201,25 @@ class TestChoosing:
         assert engines("a") is made["a"] and engines.get("") is None and engines.get("b") is made["b"]
 
     def test_own_tasks_are_those_of_every_arm_also_of_one_that_is_chosen_later(self, opened):
-        session, _, engines, _ = opened
+        session, display, engines, _ = opened
         session.choose_arm("small")
         own, gone = session.bring(TASKS["draw_c"]())
         assert gone is None and session.engine.task(own.name) is own
         session.choose_task(own.name)
         session.choose_arm("")
         assert session.scenario.task == own.name and session.task is own
+        assert not any("follows it" in text for text in display.said)
         (*_, (last, gone)) = [session.bring(TASKS["draw_c"]()) for _ in range(4)]
         assert gone is not None and own.name in session.engine.own  # it is shown
         assert gone not in engines["small"].own and last.name in engines["small"].own
+
+    def test_an_own_task_that_is_moved_for_an_arm_is_said(self, opened):
+        session, display, engines, _ = opened
+        own, _ = session.bring(TASKS["draw_c"]())
+        engines["small"].task = lambda _name: own.placed(0.5, (0.1, -0.05, 0.0))
+        session.choose_task(own.name)
+        choose(session, "small")
+        assert "“Your data” is moved to where the JACO follows it, 0.5 × as large." in display.said
 
 
 class TestRelocation:
@@ -259,9 +269,24 @@ class TestStore:
         assert store.engine("panda").follower.robot is not one.follower.robot  # the oldest of five
         assert store.engine().follower.robot is robot
 
-    def test_recordings_in_space_stay_where_they_are(self, robot):
-        entry = TaskEntry("Own", TASKS["push_box"], is_fixed=True)
-        assert in_reach({"own": entry}, replace(seven_joints(), end_effector_offset=np.ones(3)))["own"] is entry
+    def test_recordings_in_space_stay_where_they_are_while_the_arm_follows_them_there(self, robot):
+        entry, small = TaskEntry("Own", TASKS["lift_box"], is_recorded=True), shorter(robot, 0.5)
+        assert in_reach({"own": entry}, small)["own"] is entry
+        kept, moved = (in_reach({"own": entry}, arm, moves_recorded=True)["own"]() for arm in (robot, small))
+        assert kept is entry()
+        assert moved.scale < kept.scale and moved.demonstrations is kept.demonstrations
+        assert follows(small, np.array([resampled(path, 40) for path in moved.paths]))
+        assert not follows(small, np.array([resampled(path, 40) for path in kept.paths]))
+
+    def test_an_own_task_is_as_it_was_opened_for_that_arm_and_in_reach_of_another(self, robot, fits):
+        first, other = (Engine(TASKS, fits, arm) for arm in (robot, shorter(robot, 0.5)))
+        engines = Engines(first, lambda _name, _progress: other)
+        own, _ = first.bring(TASKS["lift_box"](), "draw_s")
+        assert engines("small") is other and first.task(own.name) is own
+        placed = other.task(own.name)
+        assert placed is other.task(own.name) and placed.scale < own.scale and placed.title == own.title
+        large, _ = other.bring(TASKS["draw_s"]().placed(2.0, (0.0, 0.0, 0.0)), "draw_s")  # as it was asked for
+        assert other.task(large.name) is large and first.task(large.name).scale < large.scale
 
     def test_a_task_on_the_table_takes_its_objects_along(self):
         task = TASKS["drop_pots"]()
