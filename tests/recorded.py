@@ -23,6 +23,10 @@ class Planar:
         angles = np.cumsum(q, axis=-1)
         return np.stack([0.4 * np.cos(angles).sum(-1), 0.4 * np.sin(angles).sum(-1), 0 * angles[..., 0]], axis=-1)
 
+    def hand_orientation(self, q):
+        half = q.sum(axis=-1) / 2
+        return np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], axis=-1)
+
 
 def path_of(seed=0, num=60):
     """A motion (num, 3) within an arm's reach."""

@@ -226,6 +226,24 @@ def test_the_arm_in_the_loop_gives_way_to_a_ball_that_crosses_and_arrives(push):
     assert np.linalg.norm(arm.robot.end_effector(joints[-1]) - push.goal) < 1e-3
 
 
+def test_recorded_joints_give_motions_of_the_hand_that_turn_it_as_recorded(tmp_path):
+    arm, times = dt.load_arm("jaco"), np.linspace(0.0, 3.0, 120)
+    course = (1 - np.cos(np.pi * times / times[-1])) / 2
+    goal, ways = (
+        arm.robot.home,
+        np.array([0.5, 0.2, -0.3, 0.4, 0.3, 0.6]) + np.random.default_rng(3).normal(scale=0.05, size=(4, 6)),
+    )
+    for k, way in enumerate(ways):
+        rows = np.column_stack([times, goal - (1 - course)[:, None] * way])
+        np.savetxt(tmp_path / f"{k}.csv", rows, delimiter=",", header=",".join(["t", *arm.joint_names]), comments="")
+    demonstrations = dt.load_demonstrations(tmp_path, arm=arm)
+    recorded = np.array([take.orientations for take in demonstrations])
+    np.testing.assert_allclose(recorded[0], arm.hand_orientation(goal - (1 - course)[:, None] * ways[0]), atol=1e-9)
+    followed = arm.follow(dt.fit(demonstrations).rollouts()[0])
+    assert followed.turned is not None and np.median(followed.turned) < 1.0 and followed.error.max() < 1e-3
+    assert abs((recorded[0, 0] * recorded[0, -1]).sum()) < np.cos(0.1)  # the hand turns
+
+
 def test_without_a_phase_the_field_of_an_augmented_motion_is_that_of_the_nearest_point_of_a_motion():
     motion = dt.fit(dt.example("push_box"), state="augmented").stack(dt.Avoidance(dt.Sphere((0.10, -0.53, 0.15), 0.15)))
     start = motion.rollouts()[2].positions[0]

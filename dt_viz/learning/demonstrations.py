@@ -75,7 +75,7 @@ class DemonstrationError(DataError):
 
 
 class ForwardKinematics(Protocol):
-    """What turns joint angles into places of the hand, such as `dt_viz.robot.robot.Robot`."""
+    """What turns joint angles into places and orientations of the hand, such as `dt_viz.robot.robot.Robot`."""
 
     @property
     def joint_names(self) -> Sequence[str]:
@@ -84,6 +84,10 @@ class ForwardKinematics(Protocol):
 
     def end_effector(self, q: np.ndarray) -> np.ndarray:
         """Compute the positions (T, 3) of the hand, metres, at joint angles q (T, n), rad."""
+        ...
+
+    def hand_orientation(self, q: np.ndarray) -> np.ndarray:
+        """Compute the orientations (T, 4) of the hand, unit quaternions wxyz, at such angles."""
         ...
 
 
@@ -214,8 +218,8 @@ def load_demonstrations(
         columns: names of the columns in their order, such as "t,x,y,z", or the columns to use by what they are,
             such as ``{"x": "column", "y": "other"}``; None finds them.
         topic: topic of a bag, or frame of its transforms; None takes the only one with poses.
-        arm: what turns joint angles into places of the hand: an arm, or anything with `joint_names` and
-            `end_effector`. Places in space are taken as in the frame of its base.
+        arm: what turns joint angles into places and orientations of the hand: an arm, or anything with `joint_names`,
+            `end_effector` and `hand_orientation`. Places in space are taken as in the frame of its base.
 
     Raises:
         DemonstrationError: there is no such file or folder, it cannot be read, is not what its suffix says, needs a
@@ -280,7 +284,7 @@ def demonstrations_of(
     for path, some, _ in found:
         mine, takes = takes[: len(some)], takes[len(some) :]
         with parsing(DemonstrationError, path, "takes", "recorded motions"):
-            given = [Demonstration(take.times, _hand(take, arm), take.name, take.orientations) for take in mine]
+            given = [_of_hand(take, arm) for take in mine]
         demonstrations += check_demonstrations(given, path, [take.place for take in mine])
     with naming(DemonstrationError, source):
         if not demonstrations:
@@ -316,11 +320,11 @@ def _in_frame_of(take: Take, arm: ForwardKinematics | None) -> Take:
     return replace(take, positions=take.positions @ base.T, orientations=wxyz)
 
 
-def _hand(take: Take, arm: ForwardKinematics | None) -> np.ndarray:
-    """Positions (T, d) of the hand, metres, perhaps by an arm's kinematics."""
+def _of_hand(take: Take, arm: ForwardKinematics | None) -> Demonstration:
+    """Make a demonstration of the hand, perhaps by an arm's kinematics."""
+    if take.joints is None or take.positions is not None:
+        return Demonstration(take.times, take.values, take.name, take.orientations)
     q, names = take.joints, take.joint_names
-    if take.positions is not None or q is None:
-        return take.values
     found = f"angles of {q.shape[1]} joints ({', '.join(names)[:160]})"
     if arm is None:
         accepted = "places of the hand, x, y and perhaps z; or name the arm that turns angles into such: arm=…"
@@ -328,11 +332,13 @@ def _hand(take: Take, arm: ForwardKinematics | None) -> np.ndarray:
     wanted = list(arm.joint_names)
     check_finite(q, f"joints of {take.name!r}", take.place)
     if set(wanted) <= set(names):
-        return arm.end_effector(q[:, [names.index(name) for name in wanted]])
-    if len(names) not in (len(wanted), len(wanted) + 1):  # the last one may be a gripper
+        q = q[:, [names.index(name) for name in wanted]]
+    elif len(names) in (len(wanted), len(wanted) + 1):  # the last one may be a gripper
+        q = q[:, : len(wanted)].copy()
+    else:
         accepted = f"those of the arm's {len(wanted)} ({', '.join(wanted)[:160]}), and perhaps a gripper's behind them"
         raise FormatError(f"columns of {take.name!r}", found, accepted)
-    return arm.end_effector(q[:, : len(wanted)].copy())
+    return Demonstration(take.times, arm.end_effector(q), take.name, arm.hand_orientation(q))
 
 
 def save_demonstrations(path: str | Path, demonstrations: Sequence[Demonstration]) -> None:

@@ -122,6 +122,10 @@ class Arm:
         """Compute the positions (*B, 3) of the hand, metres, at joint angles q (*B, n), rad."""
         return self.robot.end_effector(q)
 
+    def hand_orientation(self, q: ArrayLike) -> Array:
+        """Compute the orientations (*B, 4) of the hand, unit quaternions wxyz, at joint angles q (*B, n), rad."""
+        return self.robot.hand_orientation(q)
+
     def report(self) -> str:
         """Say what was chosen of the arm and why, a line for each: joints, tool, front, ready pose, body, limits."""
         return self.robot.report()

@@ -335,6 +335,7 @@ class TestJoints:
         content = table(["t", *names], [TIMES, *(size * ANGLES[:, order]).T])
         (read,) = read_demonstrations(content, "a.csv", arm=Planar())
         assert_same(read, Planar().end_effector(ANGLES))
+        np.testing.assert_allclose(read.orientations, Planar().hand_orientation(ANGLES), atol=1e-12)
         message = refusal(content, "a.csv")
         assert "angles of 2 joints" in message and "arm=…" in message
 
@@ -527,6 +528,9 @@ class Panda:
 
     def end_effector(self, q):
         return np.asarray(q)[..., :3]
+
+    def hand_orientation(self, q):
+        return np.tile([1.0, 0.0, 0.0, 0.0], (len(q), 1))
 
 
 def test_a_gripper_beside_joint_angles_says_nothing_of_their_unit(tmp_path):
