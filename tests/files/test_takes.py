@@ -335,6 +335,7 @@ class TestJoints:
         content = table(["t", *names], [TIMES, *(size * ANGLES[:, order]).T])
         (read,) = read_demonstrations(content, "a.csv", arm=Planar())
         assert_same(read, Planar().end_effector(ANGLES))
+        assert read.orientations is not None
         np.testing.assert_allclose(read.orientations, Planar().hand_orientation(ANGLES), atol=1e-12)
         message = refusal(content, "a.csv")
         assert "angles of 2 joints" in message and "arm=…" in message
