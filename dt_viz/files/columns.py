@@ -14,6 +14,7 @@ from functools import lru_cache
 import numpy as np
 
 from dt_viz.errors import UnclearError
+from dt_viz.files.checks import check_at_most
 
 UNITS: Mapping[str, tuple[str, float]] = {
     **{"m": ("length", 1.0), "cm": ("length", 1e-2), "mm": ("length", 1e-3)},
@@ -60,6 +61,8 @@ ANGLES = {"q", "j", "joint", "theta", "angle", "axis", "pos", "position", "posit
 JOINTS = {"joint", "joints", "qpos", "angles", "servo", "motor"}
 AROUND_JOINTS = (HAND - {"gripper"}) | ANGLES | JOINTS
 """Words that may stand beside the name of an arm's joint: ``observation.state.shoulder_pan.pos``."""
+MAX_COLUMNS = 1000
+"""Number of columns without names of their own that a matrix may have; an empty one may claim billions."""
 MAX_TURN = 4 * np.pi
 """Largest joint angle, rad; numbers beyond it are degrees."""
 
@@ -181,6 +184,7 @@ def expanded(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
     elif width == 7 and words & (HAND | POSITIONS) and _is_unit(values[:, 3:]) and not words & JOINTS:
         parts = (*(f"position.{axis}" for axis in "xyz"), *(f"orientation.{axis}" for axis in "xyzw"))
     elif words & JOINTS or name in ("q", "state", "states", "observation.state"):
+        check_at_most(f"columns of {name[:40]!r}", width, MAX_COLUMNS)
         parts = (f"joint{k + 1}" for k in range(width))
     elif width in (2, 3):
         parts = "xyz"[:width]
@@ -192,6 +196,7 @@ def expanded(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
 
 def numbered(width: int) -> list[str]:
     """Name columns that have no names, for those who are asked what they are."""
+    check_at_most("columns", width, MAX_COLUMNS)
     return [f"column {k + 1}" for k in range(width)]
 
 

@@ -10,6 +10,7 @@ import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from tempfile import TemporaryDirectory
 
 import hostile
 import numpy as np
@@ -70,11 +71,13 @@ def reading(*arguments: str) -> Iterator[ReadingProcess]:
     environment["OPENBLAS_NUM_THREADS"] = "1"
     command = [sys.executable, "-W", "error", hostile.__file__, *arguments]
     pipe = subprocess.PIPE
-    with subprocess.Popen(command, env=environment, stdin=pipe, stdout=pipe, stderr=pipe) as process:
-        try:
-            yield ReadingProcess(process)
-        finally:
-            process.kill()
+    with TemporaryDirectory(ignore_cleanup_errors=True) as folder:  # of what is killed here, and so leaves its own
+        environment["TMPDIR"] = folder
+        with subprocess.Popen(command, env=environment, stdin=pipe, stdout=pipe, stderr=pipe) as process:
+            try:
+                yield ReadingProcess(process)
+            finally:
+                process.kill()
 
 
 def check(outcome: Outcome, name: str) -> None:

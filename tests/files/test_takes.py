@@ -534,6 +534,13 @@ class Panda:
         return np.tile([1.0, 0.0, 0.0, 0.0], (len(q), 1))
 
 
+@pytest.mark.parametrize("name", ["positions", "joints"])
+def test_an_empty_array_that_claims_very_many_columns_is_refused_at_once(tmp_path, name):
+    np.savez(tmp_path / "a.npz", **{name: np.empty((3, 0, 10**9)), "times": TIMES})  # pyright: ignore[reportArgumentType]
+    with pytest.raises(DemonstrationError, match=r"columns.*1000000000.*at most 1000"):
+        load_demonstrations(tmp_path / "a.npz", arm=Panda())
+
+
 def test_a_gripper_beside_joint_angles_says_nothing_of_their_unit(tmp_path):
     q = np.column_stack([np.resize(path_of(), (60, 3)), np.zeros((60, 4)), np.linspace(0, 255, 60)])
     np.savez(tmp_path / "arm.npz", qpos=q, time=TIMES)
