@@ -39,7 +39,8 @@ def read_npz(path: Path, options: ReadOptions) -> Iterator[Table]:
 def read_npy(path: Path, options: ReadOptions) -> Iterator[Table]:
     """Read one array (T, d) or (N, T, d), perhaps with named fields."""
     try:
-        array = np.load(path, allow_pickle=False)
+        with path.open("rb") as file:  # numpy leaves a path's file open where it refuses what is in it
+            array = np.load(file, allow_pickle=False)
     except ValueError as error:
         if "allow_pickle" not in str(error):
             raise
