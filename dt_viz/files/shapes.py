@@ -103,7 +103,10 @@ def read_points(files: Files) -> Points:
     check_at_most("points", len(points), LIMITS.points)
     points = real_numbers(points, "points", "biuf")
     check_finite(np.atleast_2d(points), "points", lambda row: f"in point {row + 1}")
-    return Points(points, None if labels is None else real_numbers(labels, "labels", "biuf"), notes)
+    if labels is not None:
+        labels = real_numbers(labels, "labels", "biuf")
+        check_finite(labels.reshape(-1, 1), "labels", lambda row: f"of point {row + 1}")
+    return Points(points, labels, notes)
 
 
 def _opened(files: Files) -> tuple[bytes, str]:

@@ -232,6 +232,11 @@ class TestClouds:
             (npz(points=POINTS, labels=np.zeros(1000)), "a.npz", "all 1000 points free"),
             (npz(points=POINTS, labels=np.multiply(3, LABELS)), "a.npz", "labels: found 3 for point"),
             (npz(points=POINTS, labels=LABELS[:10]), "a.npz", "shape (10,)"),
+            (
+                npz(points=POINTS, labels=np.where(np.equal(np.arange(1000), 6), np.nan, LABELS)),
+                "a.npz",
+                "labels: found nan of point 7",
+            ),
             (npz(points=POINTS[:, :2]), "a.npz", "shape (1000, 2)"),
             (npz(other=POINTS), "a.npz", "arrays: found no 'points'"),
             (
