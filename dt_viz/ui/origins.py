@@ -110,15 +110,20 @@ def address_of(peer: str, forwarded: Iterable[str]) -> str:
 
     Args:
         peer: the other end of the connection.
-        forwarded: values of the header ``X-Forwarded-For``, to which a proxy adds who has connected to it. Only one on
-            this machine is believed: anybody may send the header.
+        forwarded: values of the header ``X-Forwarded-For``, to which a proxy adds who has connected to it, perhaps with
+            a port. Only one on this machine is believed: anybody may send the header. What is no address counts as a
+            name, so that nobody goes uncounted.
     """
-    address = _address(peer)
+    host, address = peer, _address(peer)
     if address is not None and address.is_loopback:
-        address = _address(",".join(forwarded).rpartition(",")[2].strip())
-    if address is None or address.is_loopback:
-        return ""
-    return str(ipaddress.ip_network((address, 64 if address.version == 6 else 32), strict=False))
+        host = ",".join(forwarded).rpartition(",")[2].strip()
+        parts = _split(f"//{host}")  # None of an address of IPv6 without brackets, which has no port
+        host = host if parts is None else parts.hostname or host
+        address = _address(host)
+    if address is None:
+        return host
+    network = ipaddress.ip_network((address, 64 if address.version == 6 else 32), strict=False)
+    return "" if address.is_loopback else str(network)
 
 
 def _split(text: str) -> SplitResult | None:
@@ -134,10 +139,12 @@ def _split(text: str) -> SplitResult | None:
 
 
 def _address(host: str | None) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    """Parse an address; one of IPv4 that is written as one of IPv6, as dual-stack sockets do, is one of IPv4."""
     try:
-        return ipaddress.ip_address(host or "")
+        address = ipaddress.ip_address(host or "")
     except ValueError:
         return None
+    return address if isinstance(address, ipaddress.IPv4Address) else address.ipv4_mapped or address
 
 
 def _canonical(host: str) -> str:
