@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -30,7 +32,8 @@ def read_bag(path: Path, options: ReadOptions) -> Iterator[Table]:
     """
     reader = imported("rosbags.highlevel", "ros").AnyReader
     typesys = imported("rosbags.typesys", "ros")
-    with reader([path], default_typestore=typesys.get_typestore(typesys.Stores.LATEST)) as bag:
+    latest = typesys.get_typestore(typesys.Stores.LATEST)
+    with _lower_suffix(path) as lower, reader([lower], default_typestore=latest) as bag:
         chosen, frame = _chosen(bag, options.topic)
         messages = (
             (time, bag.deserialize(content, connection.msgtype)) for connection, time, content in bag.messages(chosen)
@@ -48,6 +51,18 @@ def read_bag(path: Path, options: ReadOptions) -> Iterator[Table]:
     values = np.array([place for _, place in samples]).reshape(len(samples), -1)
     names = ("x", "y", "z", "qx", "qy", "qz", "qw")[: values.shape[1]]
     yield Table(path.stem, {"t": _seconds(times)} | {name: values[:, k] for k, name in enumerate(names)})
+
+
+@contextmanager
+def _lower_suffix(path: Path) -> Iterator[Path]:
+    """Give a path of the bag with a suffix in lower case, as rosbags knows them."""
+    if path.suffix == path.suffix.lower() or path.is_dir():
+        yield path
+        return
+    with TemporaryDirectory() as folder:
+        link = Path(folder, f"bag{path.suffix.lower()}")
+        link.symlink_to(path.resolve())
+        yield link
 
 
 def _kind(connection: Any) -> str:  # noqa: ANN401 - of rosbags

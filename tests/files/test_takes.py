@@ -449,7 +449,9 @@ class TestBags:
     )
     def test_poses(self, tmp_path, suffix, topics):
         path = bag(tmp_path / f"take{suffix}", topics)
-        for read in (load_demonstrations(path), read_demonstrations(path.read_bytes(), f"take{suffix}")):
+        loud = tmp_path / f"loud{suffix.upper()}"
+        loud.write_bytes(path.read_bytes())
+        for read in (*map(load_demonstrations, (path, loud)), read_demonstrations(path.read_bytes(), f"take{suffix}")):
             assert len(read) == 1
             assert_same(read[0], path_of())
             assert_turns(read[0], wxyz(turns_of()))
