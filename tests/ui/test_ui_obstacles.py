@@ -80,6 +80,22 @@ def test_what_is_resized_is_not_sent_again(shown):
     assert item.mesh.scale == pytest.approx(0.2 / 0.15)
 
 
+def test_what_another_thread_deletes_during_a_drag_is_moved_no_more(shown):
+    class Session:
+        left, edits, begin_gesture, end_gesture = [scenario(BALL), scenario()], [], ignored, ignored
+        scenario = property(lambda self: self.left.pop(0) if self.left[1:] else self.left[0])
+
+        def edit(self, gesture, **_changes):
+            self.edits.append(gesture)
+
+    session = Session()
+    shown._session = lambda: session
+    shown.adopt(scenario(BALL))
+    for phase in ("start", "update", "end"):
+        shown.moved(shown.items[0], np.array(BOX.position), np.array(BOX.wxyz), phase)
+    assert session.edits == ["obstacle 0"]
+
+
 @pytest.mark.parametrize(("selected", "expected"), [(0, [1, 0, 0]), (1, [0, 1, 0]), (2, [0, 0, 1]), (7, [0, 0, 1])])
 def test_only_the_selected_obstacle_has_handles_and_none_in_a_picture(shown, selected, expected):
     def handles():

@@ -216,9 +216,9 @@ class MarkerGroup(Draggable[M]):
         session = self._session()
         if phase == "start":
             session.begin_gesture()
-        if marker.key in self._things(session.scenario):
-            changes = self._moved(session.scenario, marker.key, position, wxyz)
-            session.edit(self.gesture.format(marker.key), **changes)
+        scenario, key = session.scenario, marker.key  # which other threads replace
+        if key in self._things(scenario):
+            session.edit(self.gesture.format(key), **self._moved(scenario, key, position, wxyz))
         if phase == "end":
             session.end_gesture()
 
