@@ -40,9 +40,10 @@ def start_module(
 
 
 def end_session(process: subprocess.Popen) -> None:
-    """End a process with a session of its own, and what it has started."""
-    if hasattr(os, "killpg") and process.poll() is None:
-        os.killpg(process.pid, signal.SIGKILL)
+    """End a process with a session of its own, and what it has started, also if it has ended itself before."""
+    if hasattr(os, "killpg"):
+        with suppress(ProcessLookupError, PermissionError):  # none is left, or, on macOS, none but dead ones
+            os.killpg(process.pid, signal.SIGKILL)
     process.kill()
     process.wait()
     if process.stdin is not None:

@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 from typing import cast
 
+import leftovers
 import numpy as np
 import pytest
 import trimesh
@@ -66,13 +67,25 @@ def test_what_is_refused_says_why_in_one_line():
         "open(os.path.join(os.environ['TMPDIR'], 'x'), 'wb').write(bytes(2 * 10**8))",
         "os.abort()",
         "sockets = [__import__('socket').socket() for _ in range(100)]",
-        "os.kill(os.getppid(), 9)",
     ],
 )
 def test_what_it_does_beyond_its_limits_ends_it_and_nothing_else(reader, hostile):
     reader(hostile)
     with pytest.raises(ShapeError, match="ended its reader"):
         read_mesh(BOX, "a.stl")
+
+
+@LINUX
+def test_a_reader_that_ends_its_parent_is_ended_with_it(reader, tmp_path):
+    reader("""
+        open(__file__ + ".pid", "w").write(str(os.getpid()))
+        os.kill(os.getppid(), 9)
+        time.sleep(60)
+    """)
+    with pytest.raises(ShapeError, match="ended its reader"):
+        read_mesh(BOX, "a.stl")
+    (file,) = tmp_path.glob("*.pid")
+    wait_until(lambda: not leftovers._read(leftovers.PROC / file.read_text() / "cmdline"))
 
 
 @pytest.mark.parametrize(
