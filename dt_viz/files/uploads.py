@@ -56,19 +56,21 @@ class _Process:
         paths = [self._folder / name for name in (worker.REQUEST, worker.ANSWER)]
         with paths[0].open("wb") as file:
             file.writelines(request)
-        self._line(START, cancelled)
+        found = f"none that is ready within {START:.0f} s"
+        self._line(START, cancelled, FormatError("reader", found, "another try, when the server is less busy"))
         assert self._process.stdin is not None
         with suppress(OSError):  # it may have ended
             self._process.stdin.write(b"\n")
             self._process.stdin.flush()
         self._num_lines += 1
-        code = self._line(PATIENCE, cancelled)
+        found = f"data that take more than {PATIENCE:.0f} s to read"
+        code = self._line(PATIENCE, cancelled, FormatError("file", found, "a simpler file"))
         if code != "0":
             raise _ended(code)
         self.is_idle = True
         try:
             with paths[1].open("rb") as file:
-                first = json.loads(file.readline(2**22))
+                first = json.loads(file.readline(worker.MAX_ANSWER))
                 if "refused" in first:
                     field, found, accepted = map(str, first["refused"])
                     raise FormatError(field, found, accepted)
@@ -78,15 +80,20 @@ class _Process:
                 path.unlink()
         return unpacked(first["value"], kind, "file", arrays)
 
-    def _line(self, patience: float, cancelled: Cancelled) -> str:
-        """Wait for the newest line that it has to say: one when it is ready, then a code for each request."""
+    def _line(self, patience: float, cancelled: Cancelled, late: FormatError) -> str:
+        """Wait for the newest line that it has to say: one when it is ready, then a code for each request.
+
+        Raises:
+            FormatError: it has ended, or, which `late` says, not said anything for so long.
+            UnwantedError: nobody wants it any more.
+        """
         deadline = time.monotonic() + patience
         while len(lines := self._said.read_text().splitlines()) < self._num_lines:
             if self.has_ended:
                 raise _ended(self._process.returncode)
             end_if(cancelled)
             if time.monotonic() > deadline:
-                raise FormatError("file", f"data that take more than {patience:.0f} s to read", "a simpler file")
+                raise late
             time.sleep(0.02)  # until it may be unwanted
         return lines[-1]
 

@@ -30,6 +30,8 @@ REQUEST, ANSWER = "request", "answer"
 """Names of files in the temporary folder."""
 MEMORY = 2**30
 """Largest address space of the process, bytes."""
+MAX_ANSWER = 10**8
+"""Largest size of an answer, bytes."""
 READERS: Mapping[str, Callable[..., Any]] = {
     Triangles.__name__: read_triangles,
     Points.__name__: read_points,
@@ -47,7 +49,7 @@ def limit() -> None:
     limits = {
         "RLIMIT_AS": MEMORY,
         "RLIMIT_CPU": 15,  # seconds
-        "RLIMIT_FSIZE": 10**8,  # bytes of an answer
+        "RLIMIT_FSIZE": MAX_ANSWER,
         "RLIMIT_NOFILE": 32,  # open files
         "RLIMIT_CORE": 0,
     }

@@ -119,12 +119,22 @@ def test_nothing_is_unpickled_and_no_room_is_made_for_what_is_not_there(reader):
             read_upload(Triangles, [("a.stl", content)])
 
 
-@pytest.mark.parametrize("begins", [False, True])
-def test_what_hangs_is_ended(reader, monkeypatch, begins):
+def test_the_first_line_of_an_answer_may_be_as_long_as_very_many_takes_make_it(reader):
+    reader("""
+        value = {"class": "Triangles", "vertices": "v", "faces": "f", "notes": ["x" * 10**7]}
+        return {"value": value, "arrays": ["v", "f"]}, [np.zeros((3, 3)), np.zeros((1, 3), int)]
+    """)
+    assert read_upload(Triangles, [("a.stl", BOX)]).notes == ("x" * 10**7,)
+
+
+@pytest.mark.parametrize(
+    ("begins", "words"), [(False, "reader: found none that is ready"), (True, "file: found data that take more than")]
+)
+def test_what_hangs_is_ended(reader, monkeypatch, begins, words):
     reader("time.sleep(1000)" if begins else "import time; time.sleep(1000)", begins=begins)
     monkeypatch.setattr(uploads, "PATIENCE" if begins else "START", 0.3)
     start = time.monotonic()
-    with pytest.raises(FormatError, match="take more than"):
+    with pytest.raises(FormatError, match=words):
         read_upload(Triangles, [("a.stl", bytes(10**7))])
     assert time.monotonic() - start < PATIENCE + begins * uploads.START
 
