@@ -411,6 +411,23 @@ def test_the_arm_draws_the_pattern_of_the_rollout_that_it_begins(new_engine, rol
 # --- The library ---
 
 
+@pytest.mark.parametrize("label", [-1.0, 1.0])
+def test_the_arm_in_the_loop_draws_the_pattern_of_its_label(label):
+    across, down = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, -1.0])
+    turned = [
+        replace(d, positions=np.array([0.1, -0.5, 0.15]) - d.positions[:, :1] * down + d.positions[:, 1:] * across)
+        for d in ways((-0.1, 0.1), jitter=0.0)
+    ]
+    motion, arm = dt.fit(turned, state="augmented"), dt.load_jaco()
+    (path, *_), (other, *_) = motion.rollouts(label=label), motion.rollouts(label=-label)
+    controller, q = dt.Controller(motion, arm, label), arm.follow(path).q[0]
+    controller.begin(q)
+    hand, _ = drawn(arm.robot, controller, q)
+    assert farthest_from(hand, path.positions) < 0.01 and farthest_from(hand, other.positions) > 0.05
+    with pytest.raises(FormatError, match="label: found 3"):
+        dt.Controller(motion, arm, 3.0)
+
+
 def test_velocities_and_phase_are_what_rollouts_are_made_of():
     case = CASES["wide eight"]
     motion = dt.fit(case.demonstrations)

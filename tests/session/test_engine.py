@@ -156,6 +156,13 @@ def test_without_avoidance_the_rollouts_are_the_ghost(engine, scenario):
             assert distance_from_path(ghost, path).max() < 1e-12
 
 
+def test_with_an_obstacle_far_away_nothing_changes(engine, scenario):
+    frame = frame_at(engine, placed(scenario, (3.0, 3.0, 3.0)), Stage.LIVE)
+    assert set(frame.durations.values()) == {0}
+    for path, ghost in zip(frame.rollouts, frame.ghost, strict=True):
+        np.testing.assert_allclose(path, ghost, rtol=0, atol=1e-12)
+
+
 def test_without_imitation_motions_are_straight(engine, scenario):
     frame = frame_at(engine, changed(scenario, imitation=False, avoids=False), Stage.LIVE)
     for path, start in zip(frame.rollouts, frame.task.starts, strict=True):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scenes import changed
 
-from dt_viz.control.controller import Phase
+from dt_viz.control.controller import ArmController, Phase
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.metrics import distance_from_path
 from dt_viz.obstacles.shapes import Sphere, as_point
@@ -151,6 +151,26 @@ def test_pushed_aside_again_and_again_it_still_reaches_the_goal(whole):
     assert whole.robot.end_effector(np.array(whole.passed))[:, 2].min() > 0
 
 
+def test_pushes_differ_and_are_the_same_every_time(begin, initial, monkeypatch):
+    asked = []
+    monkeypatch.setattr(ArmController, "displace", lambda _self, q: asked.append(q))
+
+    def pushes():
+        loop, found = begin(changed(initial("draw_s"), space="task")).run(2.0), []
+        for _ in range(4):
+            hand = loop.hand
+            loop.arm.push()
+            loop.run(PICTURE)
+            found.append(loop.robot.end_effector(asked.pop()) - hand)
+        return np.array(found)
+
+    found = pushes()
+    np.testing.assert_array_equal(pushes(), found)
+    lengths = np.linalg.norm(found, axis=1)
+    np.testing.assert_allclose(lengths, SETTINGS.push_distance, rtol=0.05)
+    assert ((found @ found.T) / np.outer(lengths, lengths)).min() < 0.5
+
+
 class TestHolding:
     def held(self, loop, place):
         for u in np.linspace(0, 1, 12):
@@ -255,6 +275,15 @@ def test_it_waits_for_its_first_motion(engine):
     arm.push()
     arm.advance(1.0, moves=True)
     assert arm.q is None and arm.undisturbed is None and len(arm.ahead) == 0 and arm.note == ""
+
+
+def test_it_is_put_elsewhere_and_goes_on_from_there(whole):
+    elsewhere = whole.run(1.0).arm.q + np.array([0.2, 0.1, -0.1, 0.0, 0.1, 0.0])
+    whole.arm.put(elsewhere)
+    whole.passed.clear()
+    whole.run(PICTURE)
+    assert np.abs(whole.arm.q - elsewhere).max() < 0.03
+    whole.assert_arrives_without_a_jump()
 
 
 @pytest.mark.parametrize("space", ["task", "cspace"])
