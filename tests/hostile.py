@@ -275,16 +275,16 @@ def recorded_seeds() -> Iterator[tuple[str, str, bytes, tuple[Mutation, ...]]]:
     """Recorded motions of every kind, as a visitor's and as one's own, and an archive of some."""
     with TemporaryDirectory() as folder:
         recorded.good_files(Path(folder))
-        paths = {path.suffix: path for path in sorted(Path(folder).glob("a.*"))}
+        paths = sorted(Path(folder).glob("[ab].*"))
         file = io.BytesIO()
         with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
             for suffix in (".csv", ".npy", ".mat"):
-                archive.write(paths[suffix], f"day/take{suffix}")
+                archive.write(Path(folder, f"a{suffix}"), f"day/take{suffix}")
         yield "takes", "a.zip", file.getvalue(), (with_changed_members,) * 4
-        for suffix, path in paths.items():
-            if suffix not in (".tsv", ".txt", ".dat", ".h5"):  # read as others are
-                own = (with_changed_members,) * 4 if suffix == ".npz" else ()
-                for kind in ("takes", "demonstrations")[: 1 + (suffix != ".mat")]:  # which may end the program
+        for path in paths:
+            if path.suffix not in (".tsv", ".txt", ".dat", ".h5"):  # read as others are
+                own = (with_changed_members,) * 4 if path.suffix == ".npz" else ()
+                for kind in ("takes", "demonstrations")[: 1 + (path.name != "a.mat")]:  # which may end the program
                     yield kind, path.name, path.read_bytes(), own
 
 

@@ -148,10 +148,11 @@ TEXTS = {"/log": ("std_msgs/msg/String", lambda k, types: types["std_msgs/msg/St
 
 
 def good_files(folder):
-    """A file of each kind."""
+    """A file of each kind; of MATLAB's, two."""
     np.savez(folder / "a.npz", times=TIMES, positions=path_of())
     np.save(folder / "a.npy", path_of())
-    scipy.io.savemat(folder / "a.mat", {"t": TIMES, "pos": path_of().T})
+    for name in "ab":
+        scipy.io.savemat(folder / f"{name}.mat", {"t": TIMES, "pos": path_of().T}, do_compression=name == "b")
     (folder / "a.json").write_text(
         json.dumps([{"t": t, "pos": p} for t, p in zip(TIMES.tolist(), path_of().tolist(), strict=True)])
     )
