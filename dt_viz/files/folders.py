@@ -44,7 +44,7 @@ def parts_of(path: Path) -> list[Path]:
 
 
 def accepted_as(path: Path) -> str:
-    """Describe what is accepted there."""
+    """Describe what a file with the suffix of this path must hold, for the message that refuses it."""
     return READERS.get(path.suffix.lower(), (None, "a file of recorded motions"))[1]
 
 

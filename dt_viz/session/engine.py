@@ -68,8 +68,8 @@ class Engine:
         self._last: dict[str, Solved] = {}
         """The last motion of each task: what is shown where a scenario has none."""
         self.own: dict[str, tuple[Task, FitStore, Robot]] = {}
-        """The visitor's own tasks by name, the oldest first, what was learned from each, and the arm with which it was
-        opened; for all of the engines."""
+        """Tasks of the visitor's own by name, the oldest first, what was learned from each, and the arm with which it
+        was opened: one dict, which the visitor's engines share and `bring` changes in place."""
 
     def title(self, name: str) -> str:
         """Title of the task of that name."""

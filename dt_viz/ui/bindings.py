@@ -78,7 +78,11 @@ class Bindings:
         self._bindings.append(_Binding(read, put))
 
     def properties(self, handle: Handle, **read: Read) -> Handle:
-        """Assign the properties of a handle, which is returned, what their functions read."""
+        """Bind properties of a handle of viser, such as `visible`, to what functions of the scenario return.
+
+        Returns:
+            The handle.
+        """
         for name, value in read.items():
             self.show(value, partial(setattr, handle, name))
         return handle

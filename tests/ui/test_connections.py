@@ -484,7 +484,7 @@ async def test_a_browser_tells_the_width_of_its_own_window(server, url):
         (visitor,) = server.visitors
         assert any(control.get("content") == visitor.ruler.html for control in client.controls.values())
         for ruler, width in ((Ruler(), None), (visitor.ruler, 390)):
-            picture = f"http://127.0.0.1:{server.port}/window/{ruler.token}/390"
-            with await asyncio.to_thread(urllib.request.urlopen, picture) as response:
+            address = f"http://127.0.0.1:{server.port}/window/{ruler.token}/390"
+            with await asyncio.to_thread(urllib.request.urlopen, address) as response:
                 assert response.status == 204
             assert visitor._camera._width == width

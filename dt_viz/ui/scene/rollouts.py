@@ -43,7 +43,10 @@ def demonstrations(scene: viser.SceneApi) -> OutsideTubes:
 
 
 def ghost(scene: viser.SceneApi) -> OutsideTubes:
-    """Return that of the undisturbed motion of the rollout that the arm follows, dashed; of all, if that is none."""
+    """Return the picture of the undisturbed motions: a dashed line for the rollout that the arm follows.
+
+    Where that is an added start without a motion, there is a line for each of the task's starts.
+    """
 
     def paths(frame: Frame) -> Sequence[Array]:
         shown = frame.shaping if frame.chosen is None else np.arange(len(frame.ghost)) == frame.chosen

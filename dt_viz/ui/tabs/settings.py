@@ -73,9 +73,14 @@ class _SettingField:
         visible: Callable[[Value], bool] = lambda _value: True,
         **properties: Read,
     ) -> Control:
-        """Bind an input, visible where there is a field to be seen, to it.
+        """Bind an input of the panel to this field of the chosen transform.
 
-        `shown` is the input's value for the field's, `meant` the field's for its old one and the input's.
+        Args:
+            handle: the input.
+            shown: returns the value of the input for that of the field.
+            meant: returns the new value of the field for its old one and that of the input.
+            visible: returns whether the input is visible for a value of the field; without the field it is not.
+            properties: see `Bindings.properties`.
         """
 
         def change(scenario: Scenario, value: Value) -> Mapping[str, Any]:
