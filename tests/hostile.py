@@ -178,6 +178,13 @@ def with_changed_scene(content: bytes, rng: Rng) -> bytes:
     return b"glTF" + struct.pack("<III", 2, 20 + len(text) + len(rest), len(text)) + b"JSON" + text + rest
 
 
+def with_other_shape(content: bytes, rng: Rng) -> bytes:
+    """An array's file that claims another shape."""
+    shape = str(tuple(int(n) for n in rng.choice([0, 0, 1, 7, 10**5, 10**9], size=rng.integers(1, 4)))).encode()
+    header = b"{'descr': '<f8', 'fortran_order': True, 'shape': " + shape + b", }\n"
+    return b"\x93NUMPY\1\0" + struct.pack("<H", len(header)) + header + content[128:]
+
+
 def with_changed_members(content: bytes, rng: Rng) -> bytes:
     """An archive packed anew with one member changed: its header, its length, or how it is packed."""
     try:
@@ -200,9 +207,7 @@ def with_changed_members(content: bytes, rng: Rng) -> bytes:
         case 3:
             data += bytes(int(rng.choice([1, 10**6, 10**8])))
         case 4:
-            shape = str(tuple(int(n) for n in rng.choice([1, 7, 10**5, 10**9, 0], size=rng.integers(5)))).encode()
-            header = b"{'descr': '<f8', 'fortran_order': True, 'shape': " + shape + b", }\n"
-            data = b"\x93NUMPY\1\0" + struct.pack("<H", len(header)) + header + data[128:]
+            data = with_other_shape(data, rng)
         case _:
             data = flipped(data, rng)
     members[name] = data
@@ -283,7 +288,7 @@ def recorded_seeds() -> Iterator[tuple[str, str, bytes, tuple[Mutation, ...]]]:
         yield "takes", "a.zip", file.getvalue(), (with_changed_members,) * 4
         for path in paths:
             if path.suffix not in (".tsv", ".txt", ".dat", ".h5"):  # read as others are
-                own = (with_changed_members,) * 4 if path.suffix == ".npz" else ()
+                own = {".npz": (with_changed_members,) * 4, ".npy": (with_other_shape,) * 8}.get(path.suffix, ())
                 for kind in ("takes", "demonstrations")[: 1 + (path.name != "a.mat")]:  # which may end the program
                     yield kind, path.name, path.read_bytes(), own
 
