@@ -6,11 +6,13 @@ import argparse
 import logging
 import os
 import signal
+import socket
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
@@ -23,9 +25,13 @@ if TYPE_CHECKING:
     from dt_viz.learning.store import FitStore
     from dt_viz.robot.robot import Robot
     from dt_viz.scenario.tasks import Task
+    from dt_viz.serving.board import Share
+    from dt_viz.ui.server import Server
 
 MAX_PORT = 65535
 PROG = "dt-viz"
+MAX_PROCESSES, MOST_BY_DEFAULT = 64, 4
+"""Largest number of processes that may be asked for, and that are taken unasked."""
 LOADED = 2.0
 """Time, seconds, within which compiled code is loaded, so that nothing is said of it."""
 MEASURE = "evaluate"
@@ -59,8 +65,10 @@ def _serve(options: argparse.Namespace) -> int:
     from dt_viz.learning.imitation import ImitationError  # noqa: PLC0415
     from dt_viz.learning.store import FitStore  # noqa: PLC0415
     from dt_viz.scenario.tasks import OWN, TaskEntry, known_tasks, own_task  # noqa: PLC0415
-    from dt_viz.ui.patches import GateError  # noqa: PLC0415
-    from dt_viz.ui.server import AddressError, Server  # noqa: PLC0415
+    from dt_viz.serving.board import Board, own_share  # noqa: PLC0415
+    from dt_viz.serving.listening import AddressError, listen  # noqa: PLC0415
+    from dt_viz.serving.supervisor import Supervisor  # noqa: PLC0415
+    from dt_viz.ui.server import MAX_WAITING, Server  # noqa: PLC0415
 
     handler = logging.StreamHandler()
     handler.addFilter(RateLimitFilter())
@@ -77,30 +85,57 @@ def _serve(options: argparse.Namespace) -> int:
             print(f"{PROG}: --task: found {begin!r}; accepted: {', '.join(tasks)}", file=sys.stderr)
             return 2
         fits = FitStore(default_cache_folder())
-        first = tasks[begin]()
         if options.prepare_all:
             for name in tasks:
                 task = tasks[name]()
                 fits.get(task.demonstrations, progress=_Bar(f"Learning {task.title}"))
                 print(f"Ready: {task.title}", flush=True)
             _compile(robot, threading.Event())
-        server = Server(
-            tasks,
-            fits,
-            robot,
-            task=begin,
-            host=options.host,
-            port=options.port,
-            max_sessions=options.max_sessions,
-            allowed=options.allow_origin,
-        )
-    except (DataError, ImitationError, AddressError, GateError, FileNotFoundError) as error:
+        listening = listen(options.host, options.port)
+    except (DataError, ImitationError, AddressError, FileNotFoundError) as error:
         print(f"{PROG}: {error}", file=sys.stderr)
         return 2
-    host = f"[{server.host}]" if ":" in server.host else server.host
-    print(f"DT-Viz is at http://{host}:{server.port} (Ctrl-C stops it)", flush=True)
+
+    def ready() -> None:
+        host = f"[{options.host}]" if ":" in options.host else options.host
+        print(f"DT-Viz is at http://{host}:{listening.getsockname()[1]} (Ctrl-C stops it)", flush=True)
+
+    new_server = partial(
+        Server,
+        tasks,
+        fits,
+        robot,
+        task=begin,
+        host=options.host,
+        max_sessions=options.max_sessions,
+        allowed=options.allow_origin,
+    )
+    prepare = partial(_prepare, fits, tasks[begin](), robot)
+    num_processes, num_connections = _num_processes(options.processes), options.max_sessions + MAX_WAITING
+    if num_processes == 1:
+        return _work(new_server, prepare, own_share(num_connections), listening, ready)
+    work = partial(_work, new_server, prepare)
+    return Supervisor(listening, Board(num_processes, num_connections), work, ready).run()
+
+
+def _work(
+    new_server: Callable[[socket.socket, Share], Server],
+    prepare: Callable[[Share, threading.Event], None],
+    share: Share,
+    listening: socket.socket,
+    ready: Callable[[], None] = lambda: None,
+) -> int:
+    """Serve in this process until it is interrupted; return the exit status where it cannot begin."""
+    from dt_viz.ui.patches import GateError  # noqa: PLC0415
+
+    try:
+        server = new_server(listening, share)
+    except GateError as error:
+        print(f"{PROG}: {error}", file=sys.stderr)
+        return 2
+    ready()
     leaving = threading.Event()
-    preparing = threading.Thread(target=_prepare, args=(fits, first, robot, leaving), name="preparing")
+    preparing = threading.Thread(target=prepare, args=(share, leaving), name="preparing")
     preparing.start()
     try:
         server.wait()
@@ -108,6 +143,20 @@ def _serve(options: argparse.Namespace) -> int:
         leaving.set()
         server.close()
         preparing.join()
+
+
+def _num_processes(asked: int | None) -> int:
+    """Return the number of processes: as many as asked for, or one for each core up to some, if the system can."""
+    from dt_viz.serving.supervisor import several_reason  # noqa: PLC0415
+
+    reason = several_reason()
+    if asked is None:
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        return 1 if reason else min(MOST_BY_DEFAULT, cores)
+    if asked > 1 and reason:
+        print(f"{PROG}: --processes: one process serves all, as {reason}", file=sys.stderr)
+        return 1
+    return asked
 
 
 def _unused(options: argparse.Namespace) -> str:
@@ -205,6 +254,12 @@ def _parser() -> argparse.ArgumentParser:
         "--max-sessions", type=_positive, default=8, help="visitors at a time; others wait (default: %(default)s)"
     )
     parser.add_argument(
+        "--processes",
+        type=_processes,
+        metavar="N",
+        help=f"processes that share the visitors (default: one for each core, up to {MOST_BY_DEFAULT})",
+    )
+    parser.add_argument(
         "--allow-origin",
         type=_origin,
         action="append",
@@ -237,6 +292,13 @@ def _angles(text: str) -> list[float]:
         raise argparse.ArgumentTypeError(f"found {text!r}; accepted: angles in rad, with commas between") from error
 
 
+def _processes(text: str) -> int:
+    number = int(text) if text.isdecimal() else 0
+    if not 1 <= number <= MAX_PROCESSES:
+        raise argparse.ArgumentTypeError(f"found {text!r}; accepted: 1 to {MAX_PROCESSES}")
+    return number
+
+
 def _positive(text: str) -> int:
     number = int(text) if text.isdecimal() else 0
     if number < 1:
@@ -256,8 +318,11 @@ class _Bar:
             print()
 
 
-def _prepare(fits: FitStore, task: Task, robot: Robot, leaving: threading.Event) -> None:
-    """Learn the first task and compile what a drag repeats, beside the server, which answers meanwhile."""
+def _prepare(fits: FitStore, task: Task, robot: Robot, share: Share, leaving: threading.Event) -> None:
+    """Learn the first task and compile what a drag repeats, beside the server, which answers meanwhile.
+
+    The first process does so for all; the others find it on disk.
+    """
     from dt_viz.errors import UnwantedError  # noqa: PLC0415
     from dt_viz.learning.imitation import ImitationError  # noqa: PLC0415
     from dt_viz.learning.state import has_orientations  # noqa: PLC0415
@@ -269,10 +334,14 @@ def _prepare(fits: FitStore, task: Task, robot: Robot, leaving: threading.Event)
             raise UnwantedError
         bar(fraction, message)
 
+    while not share.may_prepare:
+        if leaving.wait(0.1):
+            return
     try:
         if not has_orientations(task.demonstrations):  # else it is learned in milliseconds
             fits.get(task.demonstrations, progress=progress)
         _compile(robot, leaving)
+        share.prepared()
     except UnwantedError:
         pass
     except ImitationError as error:

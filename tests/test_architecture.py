@@ -34,10 +34,11 @@ MAY_IMPORT: Mapping[str, set[str]] = {
     "library": BELOW_SESSION - {"pictures", "files"} | {"saving"},
     "session": BELOW_SESSION | {"baselines"},
     "baselines": BELOW_SESSION - {"pictures"},
-    "ui": BELOW_SESSION | {"session", "baselines"},
+    "serving": set(),
+    "ui": BELOW_SESSION | {"session", "baselines", "serving"},
     "evaluate": BELOW_SESSION | {"session", "baselines"},
     "examples": {"foundation"},
-    "cli": BELOW_SESSION | {"session", "ui", "evaluate"},
+    "cli": BELOW_SESSION | {"session", "serving", "ui", "evaluate"},
     "__main__": {"cli"},
 }
 """The packages from the bottom up, and which of those below each may import."""

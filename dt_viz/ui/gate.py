@@ -19,11 +19,13 @@ import asyncio
 import dataclasses
 import logging
 import math
+import socket
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from http import HTTPStatus
+from importlib.metadata import version
 from typing import Any, get_type_hints
 
 import msgspec
@@ -33,6 +35,7 @@ from websockets.http11 import Request, Response
 
 from dt_viz.errors import DataError, naming
 from dt_viz.files.checks import check_size
+from dt_viz.serving.board import Share, own_share
 from dt_viz.ui import patches, scripts
 from dt_viz.ui.origins import Origins, address_of
 
@@ -66,6 +69,12 @@ KINDS: Mapping[str, str] = {
 }
 """Messages that this page uses, by viser's name, and which of the `Limits` of size each has."""
 
+HEALTH = "/health"
+"""Path that tells proxies how the server is."""
+VERSION = version("dt-viz")
+BEAT = 0.25
+"""Time after which a process tells again that its event loop runs, seconds."""
+
 Answer = Callable[[ServerConnection, Request], Response | None]
 """Callback that answers a request, or returns None to let it become a connection."""
 Refused = Callable[[viser.ClientHandle, str], None]
@@ -76,8 +85,10 @@ Refused = Callable[[viser.ClientHandle, str], None]
 class Limits:
     """Limits of what a server takes from its visitors."""
 
+    places: int
+    """Largest number of visitors."""
     connections: int
-    """Largest number of simultaneous connections."""
+    """Largest number of simultaneous connections, of visitors and of those who wait."""
     upload: int
     """Largest size of a file, bytes."""
     of_address: int = 8
@@ -209,6 +220,7 @@ class Gate:
         limits: Limits,
         refused: Refused,
         measured: scripts.Measured = lambda _token, _width: None,
+        share: Share | None = None,
     ) -> None:
         """Prepare the checks.
 
@@ -217,14 +229,16 @@ class Gate:
             limits: limits of what visitors send.
             refused: called with a visitor and the reason when a file is not accepted.
             measured: called with what a `Ruler` measures. It must only take note.
+            share: what other processes for the same address tell; None if there are none.
 
         Raises:
             GateError: viser's messages differ from the expected ones.
         """
         self.limits = limits
         self._origins, self._refused, self._measured = origins, refused, measured
-        self._connections: dict[ServerConnection, str] = {}
-        """The connections, and the address of each."""
+        self._share = share or own_share(limits.connections)
+        self._connections: dict[ServerConnection, int] = {}
+        """The connections here, and the number of each on the board."""
         self._headers = {
             "Content-Security-Policy": origins.policy,
             "X-Content-Type-Options": "nosniff",
@@ -237,25 +251,32 @@ class Gate:
         except (AttributeError, TypeError) as error:
             raise patches.GateError(str(error)) from error
 
-    def open(self, host: str, port: int, label: str) -> viser.ViserServer:
-        """Start viser's server behind the gate; the arguments are those of `viser.ViserServer`.
+    def open(self, listening: socket.socket, label: str) -> viser.ViserServer:
+        """Start viser's server behind the gate, for the connections of a socket that listens.
 
         Raises:
             GateError: viser does not start its server as expected.
         """
         patches.report_failures(lambda error: logger.error("a callback failed", exc_info=error))
-        self._server = patches.open_server(self._guarded, host=host, port=port, label=label, verbose=False)
+        self._server = patches.open_server(self._guarded, listening, label=label, verbose=False)
         return self._server
 
     def _guarded(self, handler: Any, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:  # noqa: ANN401
         """Put the gate between websockets and viser's handler of connections."""
-        asyncio.get_running_loop().set_exception_handler(_report_loop)
+        loop = asyncio.get_running_loop()
+        loop.set_exception_handler(_report_loop)
+        self._beat(loop)
         return partial(self._handle, handler), {
             **options,
             "process_request": partial(self._answer, options["process_request"]),
             "create_connection": partial(_Connection, self),
             "max_size": self.limits.image,
         }
+
+    def _beat(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Tell again and again that the event loop runs."""
+        self._share.beat()
+        loop.call_later(BEAT, self._beat, loop)
 
     def _answer(self, answer: Answer, connection: ServerConnection, request: Request) -> Response | None:
         refusal = self._refusal(connection, request)
@@ -265,9 +286,21 @@ class Gate:
         if (told := scripts.told(request.path)) is not None:
             self._measured(*told)
             return connection.respond(HTTPStatus.NO_CONTENT, "")
-        response = answer(connection, request)
+        response = self._health(connection) if request.path == HEALTH else answer(connection, request)
         if response is not None:
             response.headers.update(self._headers)
+        return response
+
+    def _health(self, connection: ServerConnection) -> Response:
+        """Answer who asks how the server is, for all its processes; with 503 if nobody else should be sent here."""
+        share, limits = self._share, self.limits
+        state = "closing" if share.is_closing else "full" if share.num_visitors >= limits.places else "ok"
+        known = {"visitors": share.num_visitors, "places": limits.places, "waiting": share.num_waiting}
+        text = msgspec.json.encode({"status": state, **known, "processes": share.num_processes, "version": VERSION})
+        status = HTTPStatus.OK if state == "ok" else HTTPStatus.SERVICE_UNAVAILABLE
+        response = connection.respond(status, text.decode())
+        del response.headers["Content-Type"]
+        response.headers["Content-Type"] = "application/json"
         return response
 
     def _refusal(self, connection: ServerConnection, request: Request) -> Refusal | None:
@@ -279,12 +312,12 @@ class Gate:
             return None
         if len(origins) > 1 or (origins and not self._origins.admits(origins[0], hosts[0])):  # none: no browser
             return FOREIGN
-        if len(self._connections) >= self.limits.connections:
+        if self._share.num_connections() >= self.limits.connections:
             return FULL
         address = address_of(connection.remote_address[0], request.headers.get_all("X-Forwarded-For"))
-        if address and list(self._connections.values()).count(address) >= self.limits.of_address:
+        if address and self._share.num_connections(address) >= self.limits.of_address:
             return CROWDED
-        self._connections[connection] = address
+        self._connections[connection] = self._share.connect(address)
         return None
 
     async def _handle(self, handler: Callable[[ServerConnection], Any], connection: ServerConnection) -> None:
@@ -295,7 +328,8 @@ class Gate:
 
     def leave(self, connection: ServerConnection) -> None:
         """Forget a lost connection."""
-        self._connections.pop(connection, None)
+        if (number := self._connections.pop(connection, None)) is not None:
+            self._share.disconnect(number)
 
     def passes(self, connection: _Connection, raw: Any) -> bool:  # noqa: ANN401 - bytes, or what no page sends
         """Return whether a message is passed on to viser.

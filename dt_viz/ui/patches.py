@@ -5,7 +5,10 @@ Each function names the public hook that would replace it. What it needs is chec
 
 from __future__ import annotations
 
+import io
+import socket
 from collections.abc import Callable
+from contextlib import redirect_stdout
 from typing import Any
 
 import numpy as np
@@ -31,12 +34,13 @@ def declared(name: str) -> type:
     return getattr(viser._messages, name)
 
 
-def open_server(options: Options, **arguments: Any) -> viser.ViserServer:  # noqa: ANN401
+def open_server(options: Options, listening: socket.socket, **arguments: Any) -> viser.ViserServer:  # noqa: ANN401
     """Start a server of viser. Hook: options of `ViserServer` that are passed on to `websockets.serve`.
 
     Args:
         options: function of viser's handler of connections and of its options for `websockets.serve`; it returns
             those that are used instead.
+        listening: socket whose connections it serves; viser itself would take the next port where one is taken.
         **arguments: those of `viser.ViserServer`.
 
     Raises:
@@ -45,14 +49,15 @@ def open_server(options: Options, **arguments: Any) -> viser.ViserServer:  # noq
     module: Any = websockets.asyncio.server
     original, used = module.serve, []
 
-    def serve(handler: Any, *where: Any, **given: Any) -> Any:  # noqa: ANN401
+    def serve(handler: Any, *_where: Any, **given: Any) -> Any:  # noqa: ANN401
         used.append(True)
         handler, given = options(handler, given)
-        return original(handler, *where, **given)
+        return original(handler, sock=listening, **given)
 
     module.serve = serve
     try:
-        server = viser.ViserServer(**arguments)
+        with redirect_stdout(io.StringIO()):  # an address, as seen by viser
+            server = viser.ViserServer(**arguments)
     finally:
         module.serve = original
     connections = getattr(getattr(server, "_websock_server", None), "_live_connections", None)

@@ -15,6 +15,8 @@ import viser
 from dt_viz.learning.store import FitStore
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.tasks import TaskEntry
+from dt_viz.serving.board import Share, own_share
+from dt_viz.serving.listening import listen
 from dt_viz.session.arms import ArmStore
 from dt_viz.ui.gate import Gate, Limits
 from dt_viz.ui.origins import Origin, Origins
@@ -25,13 +27,13 @@ from dt_viz.warning import Severity
 
 logger = logging.getLogger(__name__)
 
+MAX_WAITING = 8
+"""Largest number of visitors who wait for a place, unless it is chosen."""
+CLOSING = "The server ends. This page opens again by itself when it is back."
+"""What visitors are told when it ends."""
 
 # a visitor may leave between two pictures of the arm; a picture without a receiver is no problem
 warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
-
-
-class AddressError(OSError):
-    """An address on which the server cannot listen; the message says why and what to do."""
 
 
 class Server:
@@ -42,12 +44,14 @@ class Server:
         tasks: Mapping[str, TaskEntry],
         fits: FitStore,
         robot: Robot,
+        listening: socket.socket | None = None,
+        share: Share | None = None,
         *,
         task: str,
         host: str = "127.0.0.1",
         port: int = 8080,
         max_sessions: int = 8,
-        max_waiting: int = 8,
+        max_waiting: int = MAX_WAITING,
         allowed: Sequence[Origin] = (),
     ) -> None:
         """Listen and wait for visitors.
@@ -56,6 +60,8 @@ class Server:
             tasks: tasks by name, made for the JACO.
             fits: store shared by all visitors.
             robot: the arm.
+            listening: socket whose connections it serves; None listens on the port of the host.
+            share: what other processes for the same address tell; limits hold for all. None if there are none.
             task: first task of each visitor.
             host: address to listen on.
             port: port to listen on; 0 takes any free one.
@@ -67,7 +73,7 @@ class Server:
             AddressError: the address is not available.
             GateError: this version of viser is not supported.
         """
-        port = _checked_port(host, port)
+        listening = listening or listen(host, port)
         titles, arms = {name: entry.title for name, entry in tasks.items()}, ArmStore(tasks, fits, robot)
         self._new_visitor: Callable[[viser.ClientHandle], Visitor] = lambda client: Visitor(
             client, arms.engine(), robot, titles, task, arms
@@ -76,19 +82,17 @@ class Server:
         self._lock = threading.Condition()
         self._visitors: dict[int, Visitor | None] = {}
         """Those with a page, and None for those whose page is being built."""
-        self._waiting: dict[int, tuple[viser.ClientHandle, viser.GuiMarkdownHandle | None]] = {}
-        """Those who wait for a place, in the order in which they came, and what their page says meanwhile."""
+        self._waiting: dict[int, tuple[viser.ClientHandle, viser.GuiMarkdownHandle | None, float]] = {}
+        """Those who wait for a place, what their page says meanwhile, and when they came, the first one first."""
         self._num_building = 0
         """Number of pages that are being built, also for visitors who have left meanwhile."""
         self._closed = False
-        places = max_sessions + max_waiting
-        limits = Limits(places, upload=MAX_UPLOAD, of_address=max(2, places // 2))
-        self.gate = Gate(Origins(host, allowed), limits, _refuse, self._measured)
-        self._server = self.gate.open(host, port, "DT-Viz")
-        if self._server.get_port() != port:  # another program was faster than the check
-            self._server.stop()
-            raise AddressError(f"port {port} on {host} was taken a moment ago; choose another with --port")
-        self.host, self.port = host, port
+        connections = max_sessions + max_waiting
+        limits = Limits(max_sessions, connections, upload=MAX_UPLOAD, of_address=max(2, connections // 2))
+        self._share = share or own_share(connections)
+        self.gate = Gate(Origins(host, allowed), limits, _refuse, self._measured, self._share)
+        self._server = self.gate.open(listening, "DT-Viz")
+        self.host, self.port = host, self._server.get_port()
         self._server.gui.configure_theme(show_logo=False, show_share_button=False)
         self._server.on_client_connect(self._welcome)
         self._server.on_client_disconnect(self._farewell)
@@ -106,10 +110,14 @@ class Server:
         """
         while True:
             time.sleep(0.5)
+            self._admit()  # a place may be free in another process
 
     def close(self) -> None:
         """Close all pages and stop listening."""
         patience = 2.0  # seconds
+        self._share.close()
+        for client in self._server.get_clients().values():
+            notify(client, CLOSING, COLOURS[Severity.WARNING][0])
         with self._lock:
             self._closed = True
             self._lock.wait_for(lambda: not self._num_building, patience)  # a page that is being built needs the server
@@ -128,17 +136,26 @@ class Server:
                 f"**All {self._max_sessions} places are taken.** This page opens by itself when a place is free: close "
                 "another tab of this demo, or wait. Whoever runs the server can allow more with `--max-sessions`."
             )
-            said = client.gui.add_markdown(full) if len(self._visitors) >= self._max_sessions else None
-            self._waiting[client.client_id] = client, said
+            said = client.gui.add_markdown(full) if self._share.num_visitors >= self._max_sessions else None
+            self._waiting[client.client_id] = client, said, time.monotonic()
+            self._tell()
         self._admit()
+
+    def _tell(self) -> None:
+        """Tell other processes who is here."""
+        self._share.seat(len(self._visitors), [came for *_, came in self._waiting.values()])
 
     def _admit(self) -> None:
         """Build the page of the visitor who has waited longest, if there is a place."""
         with self._lock:
-            if self._closed or not self._waiting or len(self._visitors) >= self._max_sessions:
+            if self._closed or not self._waiting:
                 return
-            client, said = self._waiting.pop(next(iter(self._waiting)))
-            self._visitors[client.client_id] = None  # a place is taken before the page is built
+            with self._share.next_place(self._max_sessions) as is_free:
+                if not is_free:
+                    return
+                client, said, _ = self._waiting.pop(next(iter(self._waiting)))
+                self._visitors[client.client_id] = None  # a place is taken before the page is built
+                self._tell()
             self._num_building += 1
         try:
             if said is not None:
@@ -173,6 +190,7 @@ class Server:
         with self._lock:
             visitor = self._visitors.pop(client.client_id, None)
             self._waiting.pop(client.client_id, None)
+            self._tell()
         if visitor is not None:
             visitor.close()
         self._admit()
@@ -180,17 +198,3 @@ class Server:
 
 def _refuse(client: viser.ClientHandle, text: str) -> None:
     notify(client, text, COLOURS[Severity.ALARM][0])
-
-
-def _checked_port(host: str, port: int) -> int:
-    """Return the port to listen on, if it is free; viser itself would silently take the next one."""
-    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((host, port))
-        except OSError as error:
-            raise AddressError(
-                f"cannot listen on {host}:{port}: {error.strerror or error}; "
-                "choose another port with --port, or another address with --host"
-            ) from error
-        return probe.getsockname()[1]

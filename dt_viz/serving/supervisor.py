@@ -1,0 +1,234 @@
+"""The process that accepts connections, hands each to the serving process with the fewest, and sees that these run.
+
+It computes nothing itself, and starts no threads, so that a process that ends can be forked anew in no time.
+"""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import os
+import selectors
+import signal
+import socket
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from multiprocessing.connection import wait
+from multiprocessing.process import BaseProcess
+
+from dt_viz.serving.board import Board, Share
+from dt_viz.serving.listening import HandedOver, hand_over
+
+logger = logging.getLogger(__name__)
+
+TICK = 0.1
+"""Time between two looks at the processes, seconds."""
+RECENT = 1.0
+"""Time for which a connection that was handed over counts, as it may not be on the board yet, seconds."""
+SILENCE = 10.0
+"""Time without a beat after which a process counts as stuck, seconds: compiling holds it up for some."""
+PATIENCE = 2.5
+"""Time that processes have to end before they are killed, seconds."""
+RESTART = 0.5
+"""Time from one start of a process to the next one in its place, seconds, at least."""
+MAX_REQUESTS = 256
+"""Largest number of accepted connections that have not said yet what they want."""
+REQUEST = 10.0
+"""Time that they have for it, seconds."""
+REQUEST_BYTES = 4096
+"""Number of bytes of a request that are looked at."""
+UPGRADE = b"upgrade: websocket"
+
+Work = Callable[[Share, HandedOver], int]
+"""What each process does until it is interrupted, with its row of the board, and with the connections that it gets;
+returns the exit status."""
+
+
+def several_reason() -> str:
+    """Return why this system has no several processes for one address; empty where it has."""
+    if sys.platform == "darwin":
+        return "libraries of macOS do not survive a fork"
+    if not hasattr(os, "fork") or not hasattr(socket, "send_fds"):
+        return "it cannot hand connections from one process to another"
+    return ""
+
+
+@dataclass
+class _Worker:
+    """A process that serves."""
+
+    process: BaseProcess
+    channel: socket.socket
+    """Where connections are handed to it."""
+    started: float
+    handed: deque[float] = field(default_factory=deque)
+    """When connections were handed to it, those within `RECENT`."""
+
+
+class Supervisor:
+    """Runs several processes that serve one address."""
+
+    def __init__(
+        self, listening: socket.socket, board: Board, work: Work, ready: Callable[[], None] = lambda: None
+    ) -> None:
+        """Take an address, a board with a row for each process, and what each does.
+
+        Args:
+            listening: socket that listens.
+            board: its number of rows is that of the processes.
+            work: runs in each process, until KeyboardInterrupt.
+            ready: called once, when the first process serves.
+        """
+        self._listening, self._board, self._work, self._ready = listening, board, work, ready
+        self._workers: list[_Worker | None] = [None] * len(board.rows)
+        self._asking: dict[socket.socket, float] = {}
+        """Accepted connections that have not said yet what they want, and when they came."""
+        self._selector = selectors.DefaultSelector()
+        self._is_ready = False
+
+    def run(self) -> int:
+        """Serve until KeyboardInterrupt is raised, then end the processes.
+
+        Returns:
+            Exit status of a process that cannot even begin.
+        """
+        self._listening.setblocking(False)
+        self._selector.register(self._listening, selectors.EVENT_READ)
+        try:
+            while not (status := self._look_after()):
+                for key, _ in self._selector.select(TICK):
+                    if key.fileobj is self._listening:
+                        self._accept()
+                    else:
+                        self._dispatch(key.fileobj)  # pyright: ignore[reportArgumentType]
+            return status
+        finally:
+            self._end()
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                connection, _ = self._listening.accept()
+            except OSError:  # none waits, or it has left, or there are too many files
+                return
+            if len(self._asking) >= MAX_REQUESTS:
+                connection.close()
+                continue
+            connection.setblocking(False)
+            self._asking[connection] = time.monotonic()
+            self._selector.register(connection, selectors.EVENT_READ)
+
+    def _dispatch(self, connection: socket.socket) -> None:
+        """Hand a connection that asks for something to the process with the fewest."""
+        try:
+            request = connection.recv(REQUEST_BYTES, socket.MSG_PEEK)
+        except OSError:
+            request = b""
+        if not request:
+            self._forget(connection)
+            connection.close()
+            return
+        running = [k for k, worker in enumerate(self._workers) if worker is not None]
+        for k in sorted(running, key=self._load):
+            worker = self._workers[k]
+            assert worker is not None
+            with suppress(OSError):  # one that is stuck takes no more
+                self._forget(connection)
+                hand_over(worker.channel, connection)
+                if UPGRADE in request.lower():
+                    worker.handed.append(time.monotonic())
+                return
+        connection.close()
+
+    def _load(self, number: int) -> int:
+        """Return the number of connections of a process, with those that it was handed a moment ago."""
+        worker, earliest = self._workers[number], time.monotonic() - RECENT
+        assert worker is not None
+        while worker.handed and worker.handed[0] < earliest:
+            worker.handed.popleft()
+        return int((self._board.rows[number]["connections"] != 0).sum()) + len(worker.handed)
+
+    def _forget(self, connection: socket.socket) -> None:
+        if self._asking.pop(connection, None) is not None:
+            self._selector.unregister(connection)
+
+    def _look_after(self) -> int:
+        """Start processes that are missing, end stuck ones, and close connections that never ask for anything.
+
+        Returns:
+            Exit status of a process that could not even begin, and would not the next time; 0 without any.
+        """
+        now = time.monotonic()
+        for connection in [one for one, came in self._asking.items() if now - came > REQUEST]:
+            self._forget(connection)
+            connection.close()
+        for number, worker in enumerate(self._workers):
+            if worker is None:
+                self._start(number)
+            elif not worker.process.is_alive():
+                status = worker.process.exitcode or 0
+                if status > 0 and not self._has_run(number, worker):
+                    return status
+                if now - worker.started > RESTART:
+                    logger.warning("process %d has ended (%d): another one takes its place", worker.process.pid, status)
+                    worker.channel.close()
+                    self._start(number)
+            elif now - self._board.rows[number]["beat"] > SILENCE:
+                logger.warning("process %d does not answer: it is ended", worker.process.pid)
+                worker.process.kill()
+            elif not self._is_ready and self._has_run(number, worker):
+                self._is_ready = True
+                self._ready()
+        return 0
+
+    def _has_run(self, number: int, worker: _Worker) -> bool:
+        """Return whether the event loop of a process has run."""
+        return self._board.rows[number]["beat"] > worker.started
+
+    def _start(self, number: int) -> None:
+        ours, theirs = socket.socketpair()
+        ours.setblocking(False)
+        self._board.clear(number)
+        started = float(self._board.rows[number]["beat"])
+        context = multiprocessing.get_context("fork")
+        process = context.Process(target=self._run, args=(number, ours, theirs), name=f"dt-viz {number}")
+        process.start()
+        theirs.close()
+        self._workers[number] = _Worker(process, ours, started)
+
+    def _run(self, number: int, ours: socket.socket, theirs: socket.socket) -> None:
+        """Do the work, in a new process."""
+        address = self._listening.getsockname()
+        inherited = [ours, self._listening, *self._asking, *(one.channel for one in self._workers if one is not None)]
+        for connection in inherited:
+            connection.close()
+        self._selector.close()
+        parent = multiprocessing.parent_process()
+        assert parent is not None
+        threading.Thread(target=_end_after, args=(parent.sentinel,), daemon=True).start()
+        with suppress(KeyboardInterrupt):
+            sys.exit(self._work(Share(self._board, number), HandedOver(theirs, address)))
+
+    def _end(self) -> None:
+        """End all processes, also those that do not listen to reason."""
+        self._listening.close()
+        processes = [worker.process for worker in self._workers if worker is not None]
+        for process in processes:
+            process.terminate()
+        deadline = time.monotonic() + PATIENCE
+        for process in processes:
+            process.join(max(0.0, deadline - time.monotonic()))
+            if process.is_alive():
+                process.kill()
+                process.join()
+
+
+def _end_after(sentinel: int) -> None:
+    """End this process when that of the sentinel has ended."""
+    wait([sentinel])
+    os.kill(os.getpid(), signal.SIGTERM)
