@@ -86,10 +86,8 @@ class ReferencePostures:
             asked: clearance that is asked for, metres.
             which: (K,) postures whose cost is computed; that of the others is infinite.
         """
-        lacking, cost = (
-            np.maximum(asked - self._clearance(self.on_path[which], obstacle, asked), 0),
-            np.full(len(which), np.inf),
-        )
+        lacking = np.maximum(asked - self._clearance(self.on_path[which], obstacle, asked), 0)
+        cost = np.full(len(which), np.inf)
         cost[which] = self.away[which] + (self._stuck[which] * lacking).mean(axis=1)
         return cost
 
