@@ -31,7 +31,8 @@ class Concern(Enum):
     def __new__(cls, words: str, severity: Severity) -> Concern:
         """Take the words alone as the value."""
         concern = object.__new__(cls)
-        concern._value_, concern.severity = words, severity
+        concern._value_ = words
+        concern.severity = severity
         return concern
 
     COLLISION = "collision", Severity.ALARM
