@@ -1,4 +1,4 @@
-"""What developers measure: latency, drags, exactness, off the demonstrations, and all figures in one sitting."""
+"""What developers measure: latency, drags, exactness, off the demonstrations, and most figures in one sitting."""
 
 import argparse
 import json
@@ -237,7 +237,7 @@ def test_what_is_off_course_is_told_of_a_motion_that_is_spoilt():
     assert plain.shape_error[1] > good.shape_error[1] and plain.drawn < good.drawn
 
 
-# --- all in one sitting ---
+# --- most in one sitting ---
 
 
 @pytest.fixture
