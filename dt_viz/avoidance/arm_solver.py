@@ -26,8 +26,6 @@ from dt_viz.kernels.blocks import room_asked
 from dt_viz.robot.body_points import BodyPoints
 from dt_viz.robot.robot import Robot
 
-LEAST_PIN = 0.25
-"""Least size of the region around a pinned posture in which the field fades out, in that of the settings."""
 NUM_COARSE = 40
 """Number of samples of each rollout of coarse motions, before refinement."""
 MAX_DURATION = 2.0
@@ -135,9 +133,7 @@ class Solver:
         pins = self._limits.forward(self._limits.inside(self._lifted.pins))
         directions = np.stack([detour.direction for detour in met])
         # where starts or goal have little room, motions keep away from what is beside them the sooner
-        pin = float(
-            np.clip(self._room.min() + ROUNDING - self._margin, LEAST_PIN * self._settings.pin, self._settings.pin)
-        )
+        pin = float(np.clip(self._room.min() + ROUNDING - self._margin, self._settings.least_pin, self._settings.pin))
         return WholeArmField(self._robot, self._body, obstacles, directions, pins, reach, pin)
 
     def solution(self) -> ArmSolution:

@@ -21,9 +21,7 @@ from dt_viz.robot.inverse_kinematics import loses_branch, targets_of, track
 from dt_viz.robot.robot import Robot
 
 NUM_TRIED = 384
-"""Number of random postures in a lot that they are chosen from."""
-MOST_LOTS = 8
-"""Number of lots where one has none with enough room."""
+"""Number of random postures that they are chosen from."""
 SPREAD = (0.2, 2.0)
 """Smallest and largest standard deviation of their joints from the usual posture, rad."""
 TURNED = 0.05
@@ -64,36 +62,24 @@ class ReferencePostures:
         """Distances (K, N), metres, at postures (K, N, n), up to what is enough."""
         return self.body.clearance(self.robot, q.reshape(-1, q.shape[-1]), obstacle, enough).reshape(q.shape[:2])
 
-    def clear_of(self, obstacle: Union | Obstacle) -> ReferencePostures:
-        """The usual one, and those that touch no obstacle at starts and goal."""
-        ends, which = np.concatenate([self.at_starts, self.on_path[:, -1:]], axis=1), np.arange(1, len(self.references))
-        for end in ends.transpose(1, 0, 2):  # one after the other, as few are left after the first ones
-            which = which[self.body.clearance(self.robot, end[which], obstacle, 0.0) >= 0]
-        which = np.append(0, which)
-        arrays = (self.references, self.at_starts, self.on_path, self.away)
-        return ReferencePostures(self.robot, self.body, *(values[which] for values in arrays))
-
     def alike(self, posture: int) -> Mask:
         """(K,) which postures are like one of them."""
         apart = (self.on_path - self.on_path[posture]) * self.robot.levers
         return np.sqrt((apart**2).sum(axis=2).mean(axis=1)) < WholeArmSettings.of(self.robot).alike
 
-    def cost(self, obstacle: Union | Obstacle, asked: float, which: Mask) -> Array:
+    def cost(self, obstacle: Union | Obstacle, asked: float) -> Array:
         """Costs (K,), metres, of the detour from the usual postures and of what lies in the way on the path.
 
         Args:
             obstacle: what may be in the way.
             asked: clearance that is asked for, metres.
-            which: (K,) postures whose cost is computed; that of the others is infinite.
         """
-        lacking = np.maximum(asked - self._clearance(self.on_path[which], obstacle, asked), 0)
-        cost = np.full(len(which), np.inf)
-        cost[which] = self.away[which] + (self._stuck[which] * lacking).mean(axis=1)
-        return cost
+        lacking = np.maximum(asked - self._clearance(self.on_path, obstacle, asked), 0)
+        return self.away + (self._stuck * lacking).mean(axis=1)
 
 
 def reference_postures(
-    robot: Robot, usual: Array, starts: Array, path: Array, orientations: Array | None = None, num_lots: int = 1
+    robot: Robot, usual: Array, starts: Array, path: Array, orientations: Array | None = None
 ) -> ReferencePostures:
     """Find reference postures for the motions of a task.
 
@@ -107,14 +93,15 @@ def reference_postures(
         starts: (R, 3) places where motions start, metres.
         path: (T, 3) the mean motion, metres; its end is the goal.
         orientations: (R + T, 4) of the hand at starts and path, wxyz; None wants none.
-        num_lots: number of lots of random postures; more lots hold those of fewer.
 
     Returns:
         The reference postures, whose pins are those at the starts and at the goal.
     """
-    tried = np.concatenate([_lot(robot, usual, seed) for seed in range(num_lots)])  # the same for each visitor
-    wanted = None if orientations is None else np.broadcast_to(orientations[len(starts)], (len(tried), 1, 4))
-    at_start = track(robot, np.broadcast_to(starts.mean(axis=0), (len(tried), 1, 3)), tried, orientations=wanted)
+    rng = np.random.default_rng(0)  # the same for each visitor
+    scale = rng.uniform(*SPREAD, size=(NUM_TRIED, 1))
+    tried = robot.clip(usual + scale * rng.normal(size=(NUM_TRIED, robot.num_joints)))
+    wanted = None if orientations is None else np.broadcast_to(orientations[len(starts)], (NUM_TRIED, 1, 4))
+    at_start = track(robot, np.broadcast_to(starts.mean(axis=0), (NUM_TRIED, 1, 3)), tried, orientations=wanted)
     reaches = (at_start.error < REACHED) & ~at_start.limits_hit & ~at_start.damped
     references = np.concatenate([usual[None], at_start.q[reaches[:, 0], 0]])
     places = np.concatenate([starts, path])
@@ -133,10 +120,3 @@ def reference_postures(
     order = np.argsort(np.where(sound, away, np.inf), kind="stable")[: sound.sum()]
     at_starts, on_path = np.split(tracked.q[order], [len(starts)], axis=1)
     return ReferencePostures(robot, moving, references[order], at_starts, on_path, away[order])
-
-
-def _lot(robot: Robot, usual: Array, seed: int) -> Array:
-    """Draw postures (`NUM_TRIED`, n), rad, around the usual one (n,)."""
-    rng = np.random.default_rng(seed)
-    scale = rng.uniform(*SPREAD, size=(NUM_TRIED, 1))
-    return robot.clip(usual + scale * rng.normal(size=(NUM_TRIED, robot.num_joints)))

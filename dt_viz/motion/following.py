@@ -11,7 +11,7 @@ from dt_viz.avoidance.arm import WholeArm
 from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.avoidance.lift import NUM_CONFIGURATIONS, Lift, lift
 from dt_viz.avoidance.passing import Posture
-from dt_viz.avoidance.postures import MOST_LOTS, ReferencePostures, reference_postures
+from dt_viz.avoidance.postures import ReferencePostures, reference_postures
 from dt_viz.avoidance.start_status import StartStatus, start_warnings
 from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.flows.rotations import mean_orientation
@@ -233,34 +233,25 @@ class Follower:
         is_ample = last is None and bool((room >= margin).all())
         if is_ample or (keeps and room[-1] >= 0 and room[:-1].max() >= 0):
             yield last, room >= 0
-        known, clearance = self._with_room(learned, obstacle, margin)
-        free = clearance >= 0
+        known = self.reference_postures(learned)
+        clearance = known.room(obstacle, margin)
+        free, ample = clearance >= 0, clearance >= margin
         left = ~known.alike(0) if is_ample else np.ones(len(free), bool)
-        # the goal first, then as many starts as possible, then as much room there, to a tenth of what is asked for
+        # the goal first, then as many starts as possible, then as much room as is asked for
         most = free[:, -1] * free.shape[1] + free.sum(axis=1)
         kept = np.array([_as_posture(posture) == last for posture in known.references])
-        least = np.floor(10 * np.where(free, clearance, margin).min(axis=1) / max(margin, 1e-9))
-        for best in np.lexsort((known.cost(obstacle, margin, most == most.max()), -least, ~kept, -most)):
+        for best in np.lexsort((known.cost(obstacle, margin), -ample.sum(axis=1), ~kept, -most)):
             if left[best]:
                 left &= ~known.alike(int(best))
                 yield None if best == 0 else _as_posture(known.references[best]), free[best]
 
-    def _with_room(self, learned: Learned, obstacle: Union, margin: float) -> tuple[ReferencePostures, Array]:
-        """Reference postures, and their room (K, R + 1), metres: more where none has enough, but some might have it."""
-        known = self.reference_postures(learned)
-        room = known.room(obstacle, margin)
-        if (room >= margin).all(axis=1).any() or obstacle.signed_distance(learned.demonstrated.ends).min() < margin:
-            return known, room
-        more = self.reference_postures(learned, MOST_LOTS).clear_of(obstacle)
-        return (more, more.room(obstacle, margin)) if len(more.references) > 1 else (known, room)
-
-    def reference_postures(self, learned: Learned, num_lots: int = 1) -> ReferencePostures:
+    def reference_postures(self, learned: Learned) -> ReferencePostures:
         """The reference postures for a task's motions, a second's work the first time; raises as `reference`."""
         usual, paths = self._demonstrated(learned).reference, learned.demonstrated.paths
         return self._shared(
             "reference_postures",
-            (self.robot, learned, num_lots),
-            lambda: reference_postures(self.robot, usual, learned.task.starts, _mean(paths), _turns(learned), num_lots),
+            (self.robot, learned),
+            lambda: reference_postures(self.robot, usual, learned.task.starts, _mean(paths), _turns(learned)),
             newest=NUM_POSTURES,
         )
 
