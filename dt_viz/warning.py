@@ -24,17 +24,26 @@ class Severity(Enum):
 
 
 class Concern(Enum):
-    """Subject of a problem, the gravest first."""
+    """Subject of a problem, with its severity; the gravest first."""
 
-    COLLISION = "collision"
-    INEXACT = "not exact"
-    TOO_CLOSE = "too close"
-    CAUTION = "caution"
+    severity: Severity
 
-    def __init__(self, _name: str) -> None:
-        self.gravity = len(type(self).__members__)
+    def __new__(cls, words: str, severity: Severity) -> Concern:
+        """Take the words alone as the value."""
+        concern = object.__new__(cls)
+        concern._value_ = words
+        concern.severity = severity
+        return concern
+
+    COLLISION = "collision", Severity.ALARM
+    INEXACT = "not exact", Severity.WARNING
+    TOO_CLOSE = "too close", Severity.WARNING
+    CAUTION = "caution", Severity.WARNING
+
+    @property
+    def gravity(self) -> int:
         """Place among all concerns, 0 for the gravest."""
-        self.severity = Severity.WARNING if self.gravity else Severity.ALARM
+        return list(Concern).index(self)
 
 
 class Mend(Enum):
@@ -102,7 +111,7 @@ class Kind(Enum):
     ROLLOUT_ENTERS = Concern.COLLISION, Mend.FLOW
     """The arm, avoiding as a whole, enters an obstacle on some rollout."""
     ARM_TOO_NEAR = Concern.TOO_CLOSE, Mend.FLOW
-    """The same nearer than the margin."""
+    """The arm, avoiding as a whole, keeps less than the margin from an obstacle on some rollout."""
     ARM_ENTERS = Concern.COLLISION, Mend.WHOLE_ARM, "ROLLOUT_ENTERS"
     """The arm that is shown enters an obstacle."""
     ARM_HITS_ITSELF = Concern.TOO_CLOSE

@@ -350,7 +350,7 @@ def hostile_file(number: int) -> tuple[str, str, bytes]:
 def read(kind: str, name: str, content: bytes) -> None:
     """Read a file and look whether what it gives can be used."""
     if kind == "demonstrations":
-        for demonstration in demos.read_demonstrations(content, name, arm=recorded.Planar()):
+        for demonstration in recorded.read_demonstrations(content, name, arm=recorded.Planar()):
             assert np.isfinite(demonstration.positions).all()
             assert (np.diff(demonstration.times) > 0).all()
         return

@@ -2,11 +2,15 @@
 
 import json
 from contextlib import suppress
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
 import scipy.io
 from scipy.spatial.transform import Rotation
+
+from dt_viz.learning.demonstrations import load_demonstrations
 
 TIMES = 0.02 * np.arange(60)
 RNG = np.random.default_rng(1)
@@ -45,6 +49,14 @@ def wxyz(turns):
 def table(names, columns, delimiter=","):
     rows = [delimiter.join(f"{value!r}" for value in map(float, row)) for row in np.column_stack(columns)]
     return "\n".join([delimiter.join(names), *rows]).encode()
+
+
+def read_demonstrations(content, name, **options):
+    """Load a file of this content from the folder that it lies in, so that messages begin with its name alone."""
+    with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        Path(name).write_bytes(content)
+        return load_demonstrations(name, **options)
 
 
 def lerobot(folder, names):

@@ -92,8 +92,6 @@ class WholeArmField(ArmField, CompiledField):
     """(M, n) postures that do not move, rad."""
     reach: float
     """Distance from an obstacle's surface at which the field ends, metres."""
-    pin: float | None = None
-    """Size of the region around a pinned posture in which the field fades out, metres; None is that of the settings."""
 
     @cached_property
     def _escape(self) -> escape.Escape:
@@ -119,7 +117,7 @@ class WholeArmField(ArmField, CompiledField):
             hand_weight=settings.hand_weight,
             pins=np.array(self.pins, dtype=float),
             levers=np.array(self.robot.levers),
-            pin=settings.pin if self.pin is None else self.pin,
+            pin=settings.pin,
         )
 
     def __call__(self, q: Array) -> Array:

@@ -31,8 +31,6 @@ class WholeArmSettings:
     """Weight of the end effector's motion, rad²/m²: a contact of the forearm is resolved with the hand at rest."""
     pin: float = scales(0.02)
     """Size of the region around a pinned posture in which the field fades out, metres by `Robot.levers`."""
-    least_pin: float = scales(0.005)
-    """Size of that region where the pinned postures have no room beyond the margin, metres."""
     speed: float = scales(0.2)
     """Distance that a contact at full strength escapes in a unit of flow time, metres."""
     coarse_spacing: float = scales(0.025)

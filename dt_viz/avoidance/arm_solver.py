@@ -110,13 +110,12 @@ class Solver:
         self._lifted = lifted
         self._avoidance = avoidance
         self._detours = tuple(detours)
+        self._generator = self._generated([detour for detour in detours if detour is not None])
         self._spacing = spacing
+        self._coarse = coarse and self._generator is not None
         self._between = between
         self._margin = max(float(avoidance.margin), 2 * ROUNDING)
-        enough = self._margin + max(self._settings.pin, ROUNDING)
-        self._room = body.clearance(robot, lifted.pins, avoidance.avoided, enough) - ROUNDING
-        self._generator = self._generated([detour for detour in detours if detour is not None])
-        self._coarse = coarse and self._generator is not None
+        self._room = body.clearance(robot, lifted.pins, avoidance.avoided, self._margin + ROUNDING) - ROUNDING
 
     @cached_property
     def _settings(self) -> WholeArmSettings:
@@ -132,9 +131,7 @@ class Solver:
             return GradientField(self._robot, self._body, obstacles, reach)
         pins = self._limits.forward(self._limits.inside(self._lifted.pins))
         directions = np.stack([detour.direction for detour in met])
-        # where starts or goal have little room, motions keep away from what is beside them the sooner
-        pin = float(np.clip(self._room.min() + ROUNDING - self._margin, self._settings.least_pin, self._settings.pin))
-        return WholeArmField(self._robot, self._body, obstacles, directions, pins, reach, pin)
+        return WholeArmField(self._robot, self._body, obstacles, directions, pins, reach)
 
     def solution(self) -> ArmSolution:
         """Find the motions: with `auto`, after the shortest duration that clears them."""

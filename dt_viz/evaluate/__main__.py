@@ -18,15 +18,19 @@ FORMER: Mapping[str, tuple[str, ...]] = {
     "hand": ("around", "--space", "task"),
 }
 """Former names of commands, and the arguments that they stand for."""
-MOVED = ("drag", "latency", "pictures", "scenes", "rollouts", "starts", "velocity")
-"""Former commands that are for developers now."""
+MOVED: Mapping[str, str] = {
+    **{name: name for name in ("drag", "latency", "pictures", "scenes")},
+    **dict.fromkeys(("rollouts", "starts", "velocity"), "exactness"),
+}
+"""Former commands that are for developers now, and the benchmark that each belongs to."""
 
 
 def main(arguments: Sequence[str] | None = None, prog: str = "python -m dt_viz.evaluate") -> int:
     """Run one command; returns the process' exit status, or raises SystemExit where argparse does."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     if given and given[0] in MOVED:
-        print(f"{prog}: {given[0]} is now, in a checkout: python -m tests.benchmarks", file=sys.stderr)
+        benchmark = MOVED[given[0]]
+        print(f"{prog}: {given[0]} is now, in a checkout: python -m tests.benchmarks {benchmark}", file=sys.stderr)
         return BAD_INPUT
     if given and given[0] in FORMER:
         stands_for = FORMER[given[0]]

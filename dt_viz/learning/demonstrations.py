@@ -9,7 +9,6 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Protocol
 
 import numpy as np
@@ -75,7 +74,11 @@ class DemonstrationError(DataError):
 
 
 class ForwardKinematics(Protocol):
-    """What turns joint angles into places and orientations of the hand, such as `dt_viz.robot.robot.Robot`."""
+    """What turns joint angles into places of the hand, such as `dt_viz.robot.robot.Robot`.
+
+    Two members are optional: `hand_orientation(q)`, the orientations (T, 4) of the hand, unit quaternions wxyz, and
+    `base`, the rotation (3, 3) from the frame of the arm's base to the frame of these places and orientations.
+    """
 
     @property
     def joint_names(self) -> Sequence[str]:
@@ -84,10 +87,6 @@ class ForwardKinematics(Protocol):
 
     def end_effector(self, q: np.ndarray) -> np.ndarray:
         """Compute the positions (T, 3) of the hand, metres, at joint angles q (T, n), rad."""
-        ...
-
-    def hand_orientation(self, q: np.ndarray) -> np.ndarray:
-        """Compute the orientations (T, 4) of the hand, unit quaternions wxyz, at such angles."""
         ...
 
 
@@ -218,40 +217,18 @@ def load_demonstrations(
         columns: names of the columns in their order, such as "t,x,y,z", or the columns to use by what they are,
             such as ``{"x": "column", "y": "other"}``; None finds them.
         topic: topic of a bag, or frame of its transforms; None takes the only one with poses.
-        arm: what turns joint angles into places and orientations of the hand: an arm, or anything with `joint_names`,
-            `end_effector` and `hand_orientation`. Places in space are taken as in the frame of its base.
+        arm: what turns joint angles into places of the hand, and into orientations if it has `hand_orientation`: an
+            arm, or any :class:`ForwardKinematics`. Places in space are taken as in the frame of its base.
 
     Raises:
         DemonstrationError: there is no such file or folder, it cannot be read, is not what its suffix says, needs a
             package that is not installed, has columns that are not clear, or holds demonstrations that
             :func:`check_demonstrations` refuses; or there are times beside a rate, or joint angles without an arm.
     """
-    options = ReadOptions(rate, unit, columns, topic, _joints(arm))
+    options = ReadOptions(rate, unit, columns, topic, () if arm is None else tuple(arm.joint_names))
     sources = [Path(path)] if isinstance(path, str | Path) else [*map(Path, path)]
     found = [read for source in sources for read in _found_in(source, options)]
     return demonstrations_of(found, ", ".join(map(str, sources))[:200], arm)
-
-
-def read_demonstrations(
-    content: bytes,
-    source: str | Path,
-    *,
-    arm: ForwardKinematics | None = None,
-    **options: Any,  # noqa: ANN401
-) -> tuple[Demonstration, ...]:
-    """Read the demonstrations in all bytes of a file; options and errors as of :func:`load_demonstrations`.
-
-    The suffix of the source, a name or path, says what it is; its stem names demonstrations that have no name.
-    """
-    wanted = ReadOptions(**options, joint_names=_joints(arm))
-    with TemporaryDirectory() as folder:
-        path = Path(folder, Path(source).name)
-        path.write_bytes(content)
-        return demonstrations_of([(Path(source), *_read(path, source, wanted)[1:])], source, arm)
-
-
-def _joints(arm: ForwardKinematics | None) -> tuple[str, ...]:
-    return () if arm is None else tuple(arm.joint_names)
 
 
 def demonstrations_of(
@@ -303,12 +280,11 @@ def _found_in(path: Path, options: ReadOptions) -> list[Found]:
             raise FormatError("path", "no such file or folder", "a readable file or folder")
         if not (parts := parts_of(path)):
             raise FormatError("folder", "no file of recorded motions", f"files of the kinds {', '.join(READERS)}")
-    return [_read(part, part, options) for part in parts]
-
-
-def _read(path: Path, source: str | Path, options: ReadOptions) -> Found:
-    with parsing(DemonstrationError, source, "file", accepted_as(path)):
-        return (path, *read_part(path, options))
+    found: list[Found] = []
+    for part in parts:
+        with parsing(DemonstrationError, part, "file", accepted_as(part)):
+            found.append((part, *read_part(part, options)))
+    return found
 
 
 def _in_frame_of(take: Take, arm: ForwardKinematics | None) -> Take:
@@ -321,7 +297,7 @@ def _in_frame_of(take: Take, arm: ForwardKinematics | None) -> Take:
 
 
 def _of_hand(take: Take, arm: ForwardKinematics | None) -> Demonstration:
-    """Make a demonstration of the hand, perhaps by an arm's kinematics."""
+    """Make a demonstration of the hand, perhaps by an arm's kinematics: with orientations if the arm computes them."""
     if take.joints is None or take.positions is not None:
         return Demonstration(take.times, take.values, take.name, take.orientations)
     q, names = take.joints, take.joint_names
@@ -338,7 +314,8 @@ def _of_hand(take: Take, arm: ForwardKinematics | None) -> Demonstration:
     else:
         accepted = f"those of the arm's {len(wanted)} ({', '.join(wanted)[:160]}), and perhaps a gripper's behind them"
         raise FormatError(f"columns of {take.name!r}", found, accepted)
-    return Demonstration(take.times, arm.end_effector(q), take.name, arm.hand_orientation(q))
+    orientation = getattr(arm, "hand_orientation", None)
+    return Demonstration(take.times, arm.end_effector(q), take.name, None if orientation is None else orientation(q))
 
 
 def save_demonstrations(path: str | Path, demonstrations: Sequence[Demonstration]) -> None:

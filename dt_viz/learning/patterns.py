@@ -72,7 +72,7 @@ class AugmentedSettings:
     min_pace: float = 2e-3
     """Smallest speed of the phase, relative to its mean: it never stands still."""
     min_length: float = 0.1
-    """Least length that a clock is predicted for, relative to that of the mean: from the goal, too, takes time."""
+    """Smallest length that a clock is predicted for, relative to the mean's: no length would mean no duration."""
     caught_within: float = 0.15
     """Largest change of the phase of a motion that is pushed, relative to s_max."""
     caught_above: float = 0.05

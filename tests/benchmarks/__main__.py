@@ -1,4 +1,4 @@
-"""Measure for developers: one benchmark by its name, or without a name all figures of the documents in one sitting.
+"""Measure for developers: one benchmark by its name, or without a name most figures of the documents in one sitting.
 
 python -m tests.benchmarks latency --task draw_s --seconds 8 --out latency.json
 python -m tests.benchmarks --out DIR [--lasa DIR] [--only TABLE ...]

@@ -153,11 +153,3 @@ def test_a_planner_that_knows_nothing_of_ours_tells_whether_there_is_a_way(small
     assert postures is not None and has_way(small, ball, 0.01, postures, few)
     walls = Sphere(ball.position, 4 * np.linalg.norm(ends[-1] - ends[0]))
     assert not has_way(small, walls, 0.01, postures, replace(few, seconds=0.3))
-
-
-def test_an_arm_passes_a_ball_that_leaves_its_starts_little_room(fits):
-    """All starts are 2 to 6 cm from the ball: the region in which the field fades out around them is small."""
-    arm = load_arm("z1")
-    engine = Engine(in_reach(TASKS, arm), fits, arm)
-    found = measured(engine, engine.task("draw_z"), ArmAvoidance(Sphere((-0.0691, -0.4486, 0.56), 0.0577)))
-    assert len(found.motions) == len(found.ends) - 1 and found.clearance > 0.009

@@ -1,4 +1,4 @@
-"""What developers measure: latency, drags, exactness, off the demonstrations, and all figures in one sitting."""
+"""What developers measure: latency, drags, exactness, off the demonstrations, and most figures in one sitting."""
 
 import argparse
 import json
@@ -15,7 +15,7 @@ from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
 from dt_viz.learning.augmented import fit_augmented
 from dt_viz.learning.imitation import fit
 from dt_viz.learning.timing import TimedAttractor
-from dt_viz.metrics import discrete_frechet
+from dt_viz.metrics import discrete_frechet, distance_from_path
 from dt_viz.scenario.tasks import TASKS, known_tasks
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Stage
@@ -76,6 +76,17 @@ def test_a_drag_writes_every_step_and_counts_its_jumps(measured, monkeypatch):
     assert rows[-1]["frames"] == len(places) - 1 and rows[-1]["blocked"] == arrays["blocked"].sum()
 
 
+def test_random_drags_go_through_the_motion_and_repeat(lasa):
+    task, options = known_tasks(lasa)["Hook"](), argparse.Namespace(drags=6, seed=3, step=0.001)
+    drags, again = (list(drag.paths(task, options)) for _ in range(2))
+    assert len(drags) == 6
+    for places, same in zip(drags, again, strict=True):
+        np.testing.assert_array_equal(places, same)
+        assert np.linalg.norm(np.diff(places, axis=0), axis=1).max() <= 0.001 + 1e-12
+        assert drag.REACH <= np.linalg.norm(places[-1] - places[0]) <= 2 * drag.REACH
+        assert distance_from_path(places, task.mean_path).min() < 0.001
+
+
 def test_a_scene_is_timed_until_each_stage(tmp_path):
     assert main(["scenes", "--only", "steps", "--out", str(tmp_path / "scenes.json")]) == 0
     ((times, median, worst),) = json.loads((tmp_path / "scenes.json").read_text())["tables"]
@@ -90,6 +101,16 @@ def test_a_scene_is_timed_until_each_stage(tmp_path):
 def exact(measured):
     """Runs a part of it on the hook: its rows."""
     return lambda part, options="": measured("exactness", f"--parts {part} {options}", "json")[0]
+
+
+def test_starts_are_spread_over_the_grown_box(lasa):
+    task = known_tasks(lasa)["Hook"]()
+    starts, box = exactness.random_starts(task, 600, 0), np.concatenate(task.paths)
+    middle, size = (box.min(axis=0) + box.max(axis=0)) / 2, np.ptp(box, axis=0)
+    corners = [middle - size, middle + size]  # of a box twice as large
+    np.testing.assert_allclose([starts.min(axis=0), starts.max(axis=0)], corners, atol=0.02)
+    np.testing.assert_array_equal(starts, exactness.random_starts(task, 600, 0))
+    assert (starts != exactness.random_starts(task, 600, 1)).any()
 
 
 def test_all_starts_arrive_in_closed_form_and_stepped(exact):
@@ -175,6 +196,12 @@ def test_both_sides_are_timed_at_the_accuracy_asked_for_and_all_that_is_timed_is
     assert sides["one point at a time"].seconds == 1.5 ** len(timed) > sides["exact"].seconds == 1.5
 
 
+def test_the_cheapest_stepping_is_no_finer_than_needed():
+    start = np.array([[0.3, 0.0, 0.1]])
+    coarse, fine = (compare(lambda _: straight(), start, accuracy, 1)["stepped"] for accuracy in (1e-3, 1e-9))
+    assert coarse.accurate and fine.accurate and coarse.error > fine.error
+
+
 def test_a_setting_that_is_too_coarse_is_not_taken(monkeypatch):
     def off_by_its_tolerance(system, starts, times, tolerance):
         return system.rollout(starts, times) + tolerance / 2
@@ -210,7 +237,7 @@ def test_what_is_off_course_is_told_of_a_motion_that_is_spoilt():
     assert plain.shape_error[1] > good.shape_error[1] and plain.drawn < good.drawn
 
 
-# --- all in one sitting ---
+# --- most in one sitting ---
 
 
 @pytest.fixture

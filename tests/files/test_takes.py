@@ -20,6 +20,7 @@ from recorded import (
     lerobot,
     path_of,
     pose,
+    read_demonstrations,
     robomimic,
     table,
     turns_of,
@@ -32,7 +33,6 @@ from dt_viz.learning.demonstrations import (
     Demonstration,
     DemonstrationError,
     load_demonstrations,
-    read_demonstrations,
     save_demonstrations,
 )
 
@@ -525,15 +525,12 @@ def test_a_gigabyte_is_refused_by_its_size(tmp_path):
 
 
 class Panda:
-    """Seven joints, whose hand is where the first three angles say."""
+    """Seven joints, whose hand is where the first three angles say, and whose orientations are not known."""
 
     joint_names = tuple(f"joint{k}" for k in range(1, 8))
 
     def end_effector(self, q):
         return np.asarray(q)[..., :3]
-
-    def hand_orientation(self, q):
-        return np.tile([1.0, 0.0, 0.0, 0.0], (len(q), 1))
 
 
 @pytest.mark.parametrize("name", ["positions", "joints"])
@@ -548,6 +545,7 @@ def test_a_gripper_beside_joint_angles_says_nothing_of_their_unit(tmp_path):
     np.savez(tmp_path / "arm.npz", qpos=q, time=TIMES)
     (take,) = load_demonstrations(tmp_path / "arm.npz", arm=Panda())
     np.testing.assert_allclose(take.positions, q[:, :3])
+    assert take.orientations is None
 
 
 @pytest.mark.parametrize(

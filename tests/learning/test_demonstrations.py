@@ -11,6 +11,7 @@ import scipy.io
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from recorded import read_demonstrations
 
 from dt_viz.files.tables import LIMITS
 from dt_viz.files.takes import UNTIMED
@@ -20,7 +21,6 @@ from dt_viz.learning.demonstrations import (
     check_demonstrations,
     lasa_files,
     load_demonstrations,
-    read_demonstrations,
     save_demonstrations,
 )
 

@@ -58,6 +58,12 @@ def test_inducing_points_that_are_not_evenly_spaced_are_refused(learned):
         Imitation.from_arrays(arrays)
 
 
+def test_its_clock_is_known_three_knots_beyond_the_farthest_start(learned):
+    base, farthest = learned[1].base, learned[1].transform.forward(learned[1].starts)
+    clock = base.smoothing / base.speed * np.log(np.sinh(np.linalg.norm(farthest - base.goal, axis=1) / base.smoothing))
+    assert base.knots[-4] == pytest.approx(clock.max(), abs=1e-9)
+
+
 def test_progress_never_goes_back():
     done, fitting = [], []
 
@@ -117,9 +123,12 @@ def test_units_and_place_do_not_matter(learned):
     np.testing.assert_allclose(large.system.rollout(large.starts, times), expected, atol=1e-5)
 
 
-@pytest.mark.parametrize("groups", [hooks(2, num=1), hooks(2, num=3) + hooks(2, num=3, seed=1, scale=-1.0)])
-def test_a_single_demonstration_and_starts_on_opposite_sides_of_one_goal_are_enough(groups):
-    assert mean_error(groups, fit(groups)) < 0.003
+@pytest.mark.parametrize(
+    ("groups", "largest_error"),
+    [(hooks(2, num=1), 0.002), (hooks(2, num=3) + hooks(2, num=3, seed=1, scale=-1.0), 0.003)],
+)
+def test_a_single_demonstration_and_starts_on_opposite_sides_of_one_goal_are_enough(groups, largest_error):
+    assert mean_error(groups, fit(groups)) < largest_error
 
 
 def test_a_motion_that_turns_twice_round_gets_more_layers():

@@ -92,6 +92,18 @@ def test_what_turns_too_little_or_comes_back_is_not_sheared():
     assert module._axis(there_and_back) is None
 
 
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("sides", [[1], [1, -1]])
+def test_unbending_ends_in_the_motions_and_begins_with_straight_rays(dim, sides):
+    one = np.stack([resample_by_arc_length(d.positions - d.positions[-1], 40) for d in drawing(0, dim)])
+    motions = np.concatenate([side * one for side in sides])
+    shapes = np.stack(unbending(motions, 2, 3.0, 8))
+    np.testing.assert_allclose(shapes[-1], motions, atol=1e-9)
+    np.testing.assert_allclose(shapes[:, :, -1], 0, atol=1e-9)
+    np.testing.assert_allclose(shapes[0], np.linspace(1, 0, 40)[:, None] * shapes[0, :, :1], atol=1e-9)
+    assert np.linalg.norm(shapes[0, :, 0], axis=1).min() > 0.1
+
+
 @pytest.mark.parametrize("turns", [2, 3])
 def test_a_shear_begins_with_straight_rays_moves_little_and_ends_in_the_motions(turns, monkeypatch):
     shapes, unbent = guess(helix(turns)), without_shear(helix(turns), monkeypatch)
