@@ -112,10 +112,11 @@ def _serve(options: argparse.Namespace) -> int:
     )
     prepare = partial(_prepare, fits, tasks[begin](), robot)
     num_processes, num_connections = _num_processes(options.processes), options.max_sessions + MAX_WAITING
-    if num_processes == 1:
-        return _work(new_server, prepare, own_share(num_connections), listening, ready)
-    work = partial(_work, new_server, prepare)
-    return Supervisor(listening, Board(num_processes, num_connections), work, ready).run()
+    with listening:
+        if num_processes == 1:
+            return _work(new_server, prepare, own_share(num_connections), listening, ready)
+        work = partial(_work, new_server, prepare)
+        return Supervisor(listening, Board(num_processes, num_connections), work, ready).run()
 
 
 def _work(

@@ -1,57 +1,23 @@
 """The command line of the demo, as a process of its own."""
 
 import asyncio
-import os
 import re
 import signal
 import subprocess
 import sys
-import threading
-from contextlib import AsyncExitStack, contextmanager
-from pathlib import Path
+from contextlib import AsyncExitStack
 
 import numpy as np
 import pytest
+from demo import PATIENCE, address, started
 
-import dt_viz
 from dt_viz.cli import main
 from dt_viz.evaluate.protocol_client import LostError, ProtocolClient
 from dt_viz.learning import store
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui import server
-from dt_viz.ui.server import AddressError
-
-APP = Path(dt_viz.__file__).parent.parent / "app.py"
-PATIENCE = 120.0
-"""Seconds that anything may take: the machine may be busy."""
-
-
-@contextmanager
-def started(cache, *arguments):
-    """The process."""
-    process = subprocess.Popen(
-        [sys.executable, str(APP), "--port", "0", *arguments],
-        env=os.environ | {"XDG_CACHE_HOME": str(cache), "PYTHONUNBUFFERED": "1"},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    guard = threading.Timer(PATIENCE, process.kill)
-    guard.start()
-    try:
-        yield process
-    finally:
-        guard.cancel()
-        process.kill()
-        process.communicate()
-
-
-def address(process):
-    """Of its WebSocket, once it answers."""
-    for line in process.stdout:
-        if found := re.search(r"DT-Viz is at http://(\S+)", line):
-            return f"ws://{found[1]}"
-    raise AssertionError(process.stderr.read())
+from dt_viz.ui.patches import GateError
+from dt_viz.ui.server import CLOSING
 
 
 def assert_ends_cleanly(process):
@@ -76,6 +42,7 @@ async def visit_and_stop(process, url, number):
         for client in clients:
             with pytest.raises(LostError):
                 await client.wait_for(lambda: False, PATIENCE)
+            assert CLOSING in client.notices
 
 
 @pytest.mark.parametrize(
@@ -109,11 +76,11 @@ def test_every_task_is_learned_before_it_is_ready_if_asked_with_a_line_for_each(
 
     def serve(*_what, **_how):
         assert learned == [entry().demonstrations for entry in TASKS.values()]
-        raise AddressError("it would be ready")
+        raise GateError("it would be ready")
 
     monkeypatch.setattr(store, "FitStore", Fits)
     monkeypatch.setattr(server, "Server", serve)
-    assert main(["--prepare-all"]) == 2
+    assert main(["--prepare-all", "--port", "0", "--processes", "1"]) == 2
     printed, errors = capsys.readouterr()
     assert re.findall("Ready: (.*)", printed) == [entry.title for entry in TASKS.values()]
     assert "it would be ready" in errors
@@ -125,17 +92,17 @@ def test_own_files_are_the_task_that_the_page_begins_with(monkeypatch, tmp_path,
         path = np.stack([300 * s, 100 * s**2 + 10 * k, 200 - 50 * s], axis=1)
         np.savetxt(tmp_path / f"{k}.csv", path, delimiter=",", header="x,y,z", comments="")
 
-    def serve(tasks, _fits, robot, *, task, **_how):
+    def serve(tasks, _fits, robot, *_where, task, **_how):
         assert robot.name == "jaco"
         shown = tasks[task]()
         assert (task, shown.title, len(shown.paths)) == ("own_data", "Own data", 2)
         assert {*TASKS} < {*tasks}
         np.testing.assert_allclose(shown.paths[0][-1], [0.3, 0.1, 0.15])
         assert shown.demonstrations[0].duration == pytest.approx(59 / 30)
-        raise AddressError("it would be ready")
+        raise GateError("it would be ready")
 
     monkeypatch.setattr(server, "Server", serve)
-    assert main([str(tmp_path), "--rate", "30", "--unit", "mm"]) == 2
+    assert main([str(tmp_path), "--rate", "30", "--unit", "mm", "--port", "0", "--processes", "1"]) == 2
     assert "it would be ready" in capsys.readouterr().err
     assert main([str(tmp_path), "--columns", "x,y"]) == 2
     assert "0.csv: columns: found 2 names for 3 columns; accepted: 3 names" in capsys.readouterr().err
@@ -159,6 +126,10 @@ def test_handlers_of_signals_are_as_before_when_it_returns(capsys):
         ("--rate 20", 2, "--rate: found without FILE"),
         ("--home 1,a", 2, "argument --home: found '1,a'; accepted: angles in rad"),
         ("--arm panda --urdf arm.urdf", 2, "--urdf: not allowed with argument --arm"),
+        *(
+            (f"--processes {number}", 2, f"argument --processes: found '{number}'; accepted: 1 to 64")
+            for number in ("0", "-1", "1000", "two")
+        ),
         ("--allow-origin demo.org", 2, "argument --allow-origin: found 'demo.org'; accepted: http://"),
     ],
 )

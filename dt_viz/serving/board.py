@@ -9,6 +9,7 @@ import hashlib
 import mmap
 import tempfile
 import time
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -45,7 +46,8 @@ class Board:
             ]
         )
         self._memory = mmap.mmap(-1, num_processes * row.itemsize)
-        self._file = tempfile.TemporaryFile()  # noqa: SIM115 - open as long as this
+        self._file = tempfile.TemporaryFile()  # noqa: SIM115 - open as long as this board is there
+        weakref.finalize(self, self._file.close)
         self.rows = np.ndarray(num_processes, row, self._memory)
         for number in range(num_processes):
             self.clear(number)

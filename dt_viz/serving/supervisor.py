@@ -30,6 +30,8 @@ TICK = 0.1
 """Time between two looks at the processes, seconds."""
 RECENT = 1.0
 """Time for which a connection that was handed over counts, as it may not be on the board yet, seconds."""
+HESITATION = 1.0
+"""Time without a beat after which a process gets connections only if all others hesitate, too, seconds."""
 SILENCE = 10.0
 """Time without a beat after which a process counts as stuck, seconds: compiling holds it up for some."""
 PATIENCE = 2.5
@@ -133,7 +135,7 @@ class Supervisor:
             self._forget(connection)
             connection.close()
             return
-        running = [k for k, worker in enumerate(self._workers) if worker is not None]
+        running = [k for k, worker in enumerate(self._workers) if worker is not None and worker.process.is_alive()]
         for k in sorted(running, key=self._load):
             worker = self._workers[k]
             assert worker is not None
@@ -145,13 +147,13 @@ class Supervisor:
                 return
         connection.close()
 
-    def _load(self, number: int) -> int:
-        """Return the number of connections of a process, with those that it was handed a moment ago."""
-        worker, earliest = self._workers[number], time.monotonic() - RECENT
+    def _load(self, number: int) -> tuple[bool, int]:
+        """Return whether a process hesitates, and its number of connections, with those it was handed a moment ago."""
+        worker, row, now = self._workers[number], self._board.rows[number], time.monotonic()
         assert worker is not None
-        while worker.handed and worker.handed[0] < earliest:
+        while worker.handed and worker.handed[0] < now - RECENT:
             worker.handed.popleft()
-        return int((self._board.rows[number]["connections"] != 0).sum()) + len(worker.handed)
+        return now - row["beat"] > HESITATION, int((row["connections"] != 0).sum()) + len(worker.handed)
 
     def _forget(self, connection: socket.socket) -> None:
         if self._asking.pop(connection, None) is not None:

@@ -8,7 +8,7 @@ import os
 import socket
 import urllib.error
 import urllib.request
-from contextlib import AsyncExitStack, asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager, closing
 from dataclasses import replace
 from time import monotonic
 
@@ -24,6 +24,7 @@ from websockets.typing import Subprotocol
 from dt_viz.evaluate.protocol_client import OBSTACLE, LostError, ProtocolClient
 from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.tasks import TASKS
+from dt_viz.serving.listening import listen
 from dt_viz.session.progress import Pace
 from dt_viz.ui import gate
 from dt_viz.ui.origins import Origin
@@ -447,7 +448,7 @@ async def test_files_that_were_given_up_are_not_held(url, server):
 
 
 def a_gate():
-    return gate.Gate(gate.Origins("127.0.0.1"), gate.Limits(1, upload=1), lambda *_: None)
+    return gate.Gate(gate.Origins("127.0.0.1"), gate.Limits(1, 1, upload=1), lambda *_: None)
 
 
 def test_a_viser_that_serves_in_another_way_is_refused(monkeypatch):
@@ -461,8 +462,11 @@ def test_a_viser_that_serves_in_another_way_is_refused(monkeypatch):
             stopped.append(self)
 
     monkeypatch.setattr(viser, "ViserServer", Other)
-    with pytest.raises(GateError, match=r"viser .* has changed .*; accepted: viser 1\.1"):
-        a_gate().open("127.0.0.1", 0, "")
+    with (
+        closing(listen("127.0.0.1", 0)) as listening,
+        pytest.raises(GateError, match=r"viser .* has changed .*; accepted: viser 1\.1"),
+    ):
+        a_gate().open(listening, "")
     assert stopped
 
 

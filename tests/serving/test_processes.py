@@ -1,0 +1,123 @@
+"""The demo in two processes: limits hold for both, and a visitor of a process that is killed finds another one."""
+
+import asyncio
+import json
+import os
+import signal
+import time
+import urllib.error
+import urllib.request
+from contextlib import AsyncExitStack
+from pathlib import Path
+
+import pytest
+from demo import PATIENCE, address, started
+
+from dt_viz.cli import _num_processes, main
+from dt_viz.evaluate.protocol_client import LostError, ProtocolClient
+from dt_viz.serving import supervisor
+from dt_viz.serving.listening import listen
+
+pytestmark = pytest.mark.skipif(bool(supervisor.several_reason()), reason=supervisor.several_reason())
+
+
+def health(url):
+    """Status and content of the answer."""
+    try:
+        with urllib.request.urlopen(f"http{url.removeprefix('ws')}/health", timeout=PATIENCE) as response:
+            return response.status, json.load(response)
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, json.load(error)
+
+
+def workers(process):
+    """Numbers of the processes that serve; only on Linux."""
+    return [int(pid) for pid in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()]
+
+
+async def comes(stack, url):
+    """A visitor who has asked for a page."""
+    client = await stack.enter_async_context(ProtocolClient(url))
+    await client.look()
+    return client
+
+
+async def until(condition):
+    deadline = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        await asyncio.sleep(0.1)
+
+
+async def fill_and_leave(url):
+    """Two places in two processes; the third visitor has the place of whoever leaves, in whichever process."""
+    async with AsyncExitStack() as all_stay:
+        assert health(url)[0] == 200
+        staying = await comes(all_stay, url)
+        assert await staying.wait_for(lambda: staying.has_picture, PATIENCE)
+        async with AsyncExitStack() as leaves:
+            leaving = await comes(leaves, url)
+            assert await leaving.wait_for(lambda: leaving.has_picture, PATIENCE)
+            third = await comes(all_stay, url)
+            await until(lambda: health(url)[1]["waiting"] == 1)
+            status, told = health(url)
+            assert (status, told["status"], told["visitors"], told["processes"]) == (503, "full", 2, 2)
+            assert not await third.wait_for(lambda: third.has_picture, 2.0)
+            assert any("All 2 places are taken" in control.get("_markdown", "") for control in third.controls.values())
+        assert await third.wait_for(lambda: third.has_picture, PATIENCE)
+        assert staying.has_picture
+
+
+async def lose_and_return(process, url):
+    """A process is killed: its visitor is lost, comes again, and has a picture; the other one feels nothing."""
+    async with AsyncExitStack() as stack:
+        clients = [await comes(stack, url) for _ in range(2)]
+        for client in clients:
+            assert await client.wait_for(lambda client=client: client.has_picture, PATIENCE)
+        killed = workers(process)[0]
+        os.kill(killed, signal.SIGKILL)
+        lost = []
+        for client in clients:
+            try:
+                await client.wait_for(lambda: False, 3.0)
+            except LostError:
+                lost.append(client)
+        assert len(lost) == 1
+        again = await comes(stack, url)
+        assert await again.wait_for(lambda: again.has_picture, PATIENCE)
+        await until(lambda: len({*workers(process)} - {killed}) == 2)
+        assert health(url)[1]["visitors"] == 2
+        assert next(client for client in clients if client not in lost).has_picture
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="processes are looked up as Linux shows them")
+def test_visitors_of_two_processes_share_the_places_and_lose_nothing_else_with_one_of_them(cache):
+    with started(cache, "--processes", "2", "--max-sessions", "2") as process:
+        url = address(process)
+        asyncio.run(fill_and_leave(url))
+        asyncio.run(until_empty(url))
+        asyncio.run(lose_and_return(process, url))
+        process.send_signal(signal.SIGTERM)
+        _, errors = process.communicate(timeout=PATIENCE)
+        assert process.returncode == 0
+        assert errors.count("\n") == 1
+        assert "another one takes its place" in errors
+
+
+async def until_empty(url):
+    await until(lambda: health(url)[1]["visitors"] == 0)
+
+
+def test_a_port_that_is_taken_is_said_in_one_line(capsys):
+    with listen("127.0.0.1", 0) as listening:
+        assert main(["--port", str(listening.getsockname()[1]), "--processes", "2"]) == 2
+    errors = capsys.readouterr().err
+    assert errors.count("\n") == 1
+    assert "choose another port with --port" in errors
+
+
+def test_where_the_system_has_no_several_processes_one_serves_and_it_is_said(monkeypatch, capsys):
+    monkeypatch.setattr(supervisor, "several_reason", lambda: "there is no fork")
+    assert (_num_processes(3), _num_processes(None), _num_processes(1)) == (1, 1, 1)
+    assert capsys.readouterr().err == "dt-viz: --processes: one process serves all, as there is no fork\n"
