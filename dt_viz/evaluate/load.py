@@ -11,30 +11,33 @@ all (figures of different machines compare in this unit), and under ``visits`` f
 ``visitors``
     for each: ``pictures_per_s``, the edits that it saw answered, and of ``gap_ms``, from one picture to the next, and
     ``latency_ms``, from an edit to its picture, the ``median``, ``p95`` and ``worst`` (null without pictures);
+    ``answered``, the part of its edits after which a picture of it or of a later one came within 0.5 s;
     ``bytes``, median received from one picture to the next; ``last_shown``, whether the last edit is answered in the
     end; ``lost``, why the connection ended, empty if it did not.
 ``ping_ms``
     round trips of WebSocket pings to the server's event loop, all visitors together.
-``cores``, ``peak_memory_mb``
-    processor time of the server in a second, and its memory at most; null if its process is unknown, or the system does
-    not report them.
+``cores``, ``memory_mb``
+    processor time of the server in a second, and its memory in the end, of all its processes, shared memory once; null
+    if they are unknown, or the system does not report them.
 ``messages_per_s``
     number of WebSocket messages that each visitor receives.
 
-With ``--rest`` nobody drags: the visitors look on while the arm goes its round.
+With ``--rest`` nobody drags: the visitors look on while the arm goes its round. With ``--lecture`` a quarter drags in
+bursts, one in twenty changes the task again and again, and the others look on.
 """
 
 from __future__ import annotations
 
 import argparse
 import asyncio
+import itertools
 import os
 import platform
 import re
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Awaitable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AsyncExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -76,9 +79,17 @@ class LoadSettings:
     """Time after the first pictures until nothing is refined any more."""
     patience: float = 60.0
     """Longest time to wait for the picture of the last edit."""
+    burst: float = 2.0
+    """Time that somebody in a lecture drags."""
+    pause: float = 4.0
+    """Time from there to the next drag, and from one change of the task to the next."""
+    answered: float = 0.5
+    """Time within which an edit counts as answered."""
 
 
 SETTINGS = LoadSettings()
+LECTURE, DRAGS, CHANGES = 20, (0, 4, 8, 12, 16), 2
+"""Number of visitors in a part of a lecture, and which of them drag, and change the task; the others look on."""
 
 
 @dataclass
@@ -114,15 +125,43 @@ class Visit:
         began = time.perf_counter()
         for number, place in enumerate(places):
             await asyncio.sleep(max(0.0, began + number / SETTINGS.edits_per_second - time.perf_counter()))
-            self.edits[place] = number
+            self.edits[place] = len(self.sent)
             self.sent.append(time.perf_counter())
             await self.client.move(place)
         await self.client.release()
+
+    async def drag_in_bursts(self, places: Sequence[Point], delay: float) -> None:
+        """Drag the obstacle through places, with pauses, from some delay on, seconds."""
+        await asyncio.sleep(delay)
+        size = round(SETTINGS.edits_per_second * SETTINGS.burst)
+        for begin in range(0, len(places), size):
+            await self.drag(places[begin : begin + size])
+            await asyncio.sleep(SETTINGS.pause)
+
+    async def change_task(self, seconds: float) -> None:
+        """Choose another task again and again, for some seconds."""
+        deadline = time.perf_counter() + seconds
+        for number in itertools.count(1):
+            titles = self.client.controls[self.client.find("Task")]["options"]
+            await self.client.set("Task", titles[number % len(titles)])
+            await asyncio.sleep(SETTINGS.pause)
+            if time.perf_counter() > deadline:
+                return
 
     @property
     def last_shown(self) -> bool:
         """Whether the last edit is answered."""
         return bool(self.seen) and self.seen[-1][0] == len(self.sent) - 1
+
+    @property
+    def answered(self) -> float | None:
+        """Part of the edits that are answered in time; None without any."""
+        if not self.sent:
+            return None
+        edits, times = np.array([[edit, now] for edit, now, _ in self.seen] or [[-1, np.inf]]).T
+        place = np.searchsorted(edits, np.arange(len(self.sent)))
+        shown = np.append(times, np.inf)[place]
+        return float(np.mean(shown - np.array(self.sent) <= SETTINGS.answered))
 
     def figures(self, seconds: float) -> dict[str, Any]:
         """The figures of a visitor that was to drag for so long; see the module. Later pictures do not count."""
@@ -133,6 +172,7 @@ class Visit:
             "pictures_per_s": len(during) / seconds,
             "gap_ms": _spread(np.diff([began, *during, began + seconds])),
             "latency_ms": _spread(np.array([now - self.sent[edit] for edit, now, _ in self.seen])),
+            "answered": self.answered,
             "bytes": float(np.median(sizes)) if len(sizes) else None,
             "last_shown": self.last_shown and not self.lost,
             "lost": self.lost,
@@ -147,10 +187,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--avoid", choices=("hand", "arm", "off"), help="what gives way; as the page opens unless given"
     )
     parser.add_argument(
-        "--clients", type=whole_number(1), nargs="+", default=(1, 2, 4, 8, 16), help="visitors at once, in turn"
+        "--visitors", "--clients", type=whole_number(1), nargs="+", default=(1, 2, 4, 8, 16), help="at once, in turn"
     )
+    parser.add_argument("--processes", type=whole_number(1), help="of the server; its own choice unless given")
     parser.add_argument("--seconds", type=positive_number("seconds", 3600), default=20.0, help="to drag (default: 20)")
-    parser.add_argument("--rest", action="store_true", help="drag nothing: measure what visitors cost who look on")
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--rest", action="store_true", help="drag nothing: measure what visitors cost who look on")
+    what.add_argument("--lecture", action="store_true", help="most look on, some drag in bursts, few change the task")
     parser.add_argument("--url", type=_url, help="of a server that runs already, such as ws://127.0.0.1:8080")
     parser.add_argument("--out", type=Path, metavar="FILE.json")
 
@@ -162,16 +205,17 @@ def run(options: argparse.Namespace) -> int:
     unit = unit_ms()
     print(f"{task.name}; a fixed piece of numpy work takes {unit:.1f} ms")
     visits = []
-    for number in options.clients:
+    for number in options.visitors:
         with _server(options, number) as (url, process):
             visits.append(asyncio.run(_visited(options, url, process, task, number)))
     report([_row(figures) for figures in visits])
     if out is not None:
-        settings = {"task": task.name, "avoid": options.avoid, "seconds": options.seconds, "rest": options.rest}
+        settings = {name: getattr(options, name) for name in ("avoid", "seconds", "rest", "lecture", "processes")}
+        settings["task"] = task.name
         machine = {"cores": os.cpu_count(), "python": platform.python_version(), "numpy": np.__version__}
         write_json(out, {"unit_ms": unit, "visits": visits, "settings": settings | machine})
     last = [visitor.get("last_shown", not visitor["lost"]) for figures in visits for visitor in figures["visitors"]]
-    return 0 if len(last) == sum(options.clients) and all(last) else 1
+    return 0 if len(last) == sum(options.visitors) and all(last) else 1
 
 
 def places_of(task: Task, number: int, num_edits: int) -> list[Point]:
@@ -198,21 +242,25 @@ async def _visited(
         visits, num_edits = [*map(Visit, clients)], max(1, round(SETTINGS.edits_per_second * options.seconds))
         before, num_before = _used(process), sum(client.num_messages for client in clients)
         began = time.perf_counter()
-        drags = [() if options.rest else places_of(task, k, num_edits) for k in range(number)]
-        measured = (_measured(visit, places, options.seconds) for visit, places in zip(visits, drags, strict=True))
-        await asyncio.gather(*measured)
+        doings = [_doing(options, visit, task, k, num_edits) for k, visit in enumerate(visits)]
+        await asyncio.gather(*(_measured(visit, doing) for visit, doing in zip(visits, doings, strict=True)))
         elapsed, after = time.perf_counter() - began, _used(process)
         num_messages = sum(client.num_messages for client in clients) - num_before
-        for visit in visits if not options.rest else ():
+        for visit in visits:
+            if not visit.sent:
+                continue
             with suppress(LostError):
                 await visit.client.wait_for(lambda visit=visit: visit.last_shown, SETTINGS.patience)
         seconds = num_edits / SETTINGS.edits_per_second
         return figures | {
-            "visitors": [{"lost": visit.lost} if options.rest else visit.figures(seconds) for visit in visits],
+            "visitors": [
+                visit.figures(seconds) if drags else {"lost": visit.lost}
+                for visit, drags in zip(visits, _who_drag(options, number), strict=True)
+            ],
             "ping_ms": _spread(np.array([ping for visit in visits for ping in visit.pings])),
             "messages_per_s": num_messages / number / elapsed,
             "cores": None if before is None or after is None else (after[0] - before[0]) / elapsed,
-            "peak_memory_mb": None if after is None else after[1],
+            "memory_mb": None if after is None else after[1],
         }
 
 
@@ -233,8 +281,27 @@ async def _first_picture(
     return None
 
 
-async def _measured(visit: Visit, places: Sequence[Point], seconds: float) -> None:
-    """Have a visitor drag through places, or look on for some seconds if there are none, and ping the server."""
+def _doing(options: argparse.Namespace, visit: Visit, task: Task, number: int, num_edits: int) -> Awaitable[None]:
+    """Return what the visitor with this number does: drag, change the task, or look on."""
+    places = places_of(task, number, num_edits)
+    if not (options.rest or options.lecture):
+        return visit.drag(places)
+    turn = number % LECTURE
+    if options.rest or turn not in (*DRAGS, CHANGES):
+        return asyncio.sleep(options.seconds)
+    if turn == CHANGES:
+        return visit.change_task(options.seconds)
+    part = SETTINGS.burst / (SETTINGS.burst + SETTINGS.pause)
+    return visit.drag_in_bursts(places[: round(part * num_edits)], SETTINGS.pause * number / options.visitors[-1])
+
+
+def _who_drag(options: argparse.Namespace, number: int) -> list[bool]:
+    """Return which of the visitors drag."""
+    return [not options.rest and (not options.lecture or k % LECTURE in DRAGS) for k in range(number)]
+
+
+async def _measured(visit: Visit, doing: Awaitable[None]) -> None:
+    """Have a visitor do something, and ping the server meanwhile."""
 
     async def ping() -> None:
         while True:
@@ -243,7 +310,7 @@ async def _measured(visit: Visit, places: Sequence[Point], seconds: float) -> No
 
     pinging = asyncio.create_task(ping())
     try:
-        await (visit.drag(places) if places else asyncio.sleep(seconds))
+        await doing
     except LostError as error:
         visit.lost = str(error)
     pinging.cancel()
@@ -262,6 +329,8 @@ def _server(options: argparse.Namespace, number: int) -> Iterator[tuple[str, int
         yield options.url, None
         return
     arguments = ["--port", "0", "--task", options.task, "--max-sessions", str(number)]
+    if options.processes is not None:
+        arguments += ["--processes", str(options.processes)]
     if options.lasa is not None:
         arguments += ["--lasa", str(options.lasa)]
     program = "from dt_viz.cli import main; raise SystemExit(main())"
@@ -280,14 +349,25 @@ def _server(options: argparse.Namespace, number: int) -> Iterator[tuple[str, int
 
 
 def _used(process: int | None) -> tuple[float, float] | None:
-    """Processor time of a process, s, and its memory at most, MB; None if it is gone or the system does not say."""
+    """Processor time of a process and of all it has started, s, and their memory, MB, what they share counted once.
+
+    None if it is gone or the system does not say.
+    """
+    if process is None:
+        return None
+    seconds, megabytes, folders = 0.0, 0.0, [Path("/proc") / str(process)]
     try:
-        fields, status = (Path(f"/proc/{process}/{name}").read_text(encoding="ascii") for name in ("stat", "status"))
+        for folder in folders:
+            fields = (folder / "stat").read_text(encoding="ascii").rpartition(")")[2].split()
+            seconds += sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")  # with those that have ended
+            memory = re.search(r"^Pss:\s*(\d+)", (folder / "smaps_rollup").read_text(encoding="ascii"), re.MULTILINE)
+            megabytes += 0 if memory is None else int(memory[1]) / 1024
+            for thread in (folder / "task").iterdir():
+                children = (thread / "children").read_text(encoding="ascii").split()
+                folders += [Path("/proc") / child for child in children]
     except OSError:
         return None
-    user, system, *_ = map(int, fields.rpartition(")")[2].split()[11:])
-    peak = re.search(r"VmHWM:\s*(\d+)", status)
-    return None if peak is None else ((user + system) / os.sysconf("SC_CLK_TCK"), int(peak[1]) / 1024)
+    return seconds, megabytes
 
 
 def _spread(seconds: Array) -> dict[str, float] | None:
@@ -310,14 +390,21 @@ def _row(figures: Mapping[str, Any]) -> Row:
         "pictures/s of each": f"{min(rates):.1f} to {max(rates):.1f}" if rates else None,
         "gap ms, median / 95 % / worst": _worst(visitor["gap_ms"] for visitor in shown),
         "edit → picture ms": _worst(visitor["latency_ms"] for visitor in shown),
+        "edits answered in 0.5 s %": _percent([visitor["answered"] for visitor in shown]),
         "kB": max((visitor["bytes"] / 1e3 for visitor in shown if visitor["bytes"]), default=None),
         "ping ms": _worst([figures.get("ping_ms")]),
         "cores": figures.get("cores"),
-        "MB": figures.get("peak_memory_mb"),
+        "MB": figures.get("memory_mb"),
         "messages/s": figures.get("messages_per_s"),
         "lost": sum(bool(visitor["lost"]) for visitor in visitors) + firsts.count(None),
         "last shown": last,
     }
+
+
+def _percent(parts: Sequence[float | None]) -> float | None:
+    """Mean of some parts in per cent; None without any."""
+    known = [part for part in parts if part is not None]
+    return 100 * float(np.mean(known)) if known else None
 
 
 def _worst(spreads: Iterable[dict[str, float] | None]) -> str | None:

@@ -2,6 +2,7 @@
 
 import json
 import socket
+from argparse import Namespace
 from types import SimpleNamespace
 from typing import Any
 
@@ -72,6 +73,25 @@ def test_a_picture_answers_the_edit_of_its_place_and_only_new_answers_count(visi
     assert figures["gap_ms"] == pytest.approx({"median": 60.0, "p95": 177.0, "worst": 190.0})
     assert figures["latency_ms"] == pytest.approx({"median": 50.0, "p95": 59.0, "worst": 60.0})
     assert figures["bytes"] == 2000
+    assert figures["answered"] == 1
+
+
+def test_an_edit_is_answered_by_a_picture_of_it_or_of_a_later_one_in_time(visit):
+    assert visit.answered == 0
+    show(visit, 0, 5.06)
+    show(visit, 2, 5.65)  # in time for edit 2, of 5.2 s, but not for edit 1
+    assert visit.answered == pytest.approx(2 / 4)
+    show(visit, 3, 5.81)
+    assert visit.answered == pytest.approx(2 / 4)
+    assert load.Visit(visit.client).answered is None
+
+
+def test_in_a_lecture_a_quarter_drags_and_one_in_twenty_changes_the_task():
+    rest, lecture, all_drag = (
+        Namespace(rest=rest, lecture=lecture) for rest, lecture in ((True, False), (False, True), (False, False))
+    )
+    assert [sum(load._who_drag(options, 40)) for options in (rest, lecture, all_drag)] == [0, 10, 40]
+    assert load.CHANGES not in load.DRAGS
 
 
 def test_a_place_that_nobody_asked_for_answers_nothing(visit):
@@ -115,7 +135,7 @@ def test_who_gives_way_is_chosen_and_visitors_of_a_started_server_who_look_on_co
     out = tmp_path / "rest.json"
     assert main(["load", "--rest", "--avoid", "off", "--clients", "1", "--seconds", "0.8", "--out", str(out)]) == 0
     (visits,) = json.loads(out.read_text())["visits"]
-    assert 0 < visits["cores"] < 4 and visits["messages_per_s"] > 1 and visits["peak_memory_mb"] > 50
+    assert 0 < visits["cores"] < 4 and visits["messages_per_s"] > 1 and visits["memory_mb"] > 50
     assert visits["visitors"] == [{"lost": ""}]
     assert as_text(visits["cores"]) in capsys.readouterr().out
 
