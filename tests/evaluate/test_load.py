@@ -13,6 +13,7 @@ from dt_viz.evaluate import load
 from dt_viz.evaluate.__main__ import main
 from dt_viz.evaluate.options import as_text
 from dt_viz.evaluate.protocol_client import ANSWERED, ROLLOUT
+from dt_viz.evaluate.visit import SETTINGS, LoadSettings, Visit, places_of
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui.server import Server
 
@@ -23,7 +24,7 @@ PATIENCE = 240.0
 
 @pytest.fixture(autouse=True)
 def patient(monkeypatch):
-    monkeypatch.setattr(load, "SETTINGS", load.LoadSettings(first_picture=PATIENCE, settled=0.0, patience=PATIENCE))
+    monkeypatch.setattr(load, "SETTINGS", LoadSettings(first_picture=PATIENCE, settled=0.0, patience=PATIENCE))
 
 
 @pytest.fixture(scope="module")
@@ -38,8 +39,8 @@ def url(fits, robot):
 def visit():
     """A visitor who has sent four edits, 0.1 s apart, since 5 s."""
     client: Any = SimpleNamespace(nodes={ANSWERED: {}}, num_bytes=0)
-    places = load.places_of(TASKS["draw_s"](), 0, 4)
-    return load.Visit(client, {place: k for k, place in enumerate(places)}, [5.0, 5.1, 5.2, 5.3])
+    places = places_of(TASKS["draw_s"](), 0, 4)
+    return Visit(client, {place: k for k, place in enumerate(places)}, [5.0, 5.1, 5.2, 5.3])
 
 
 def show(visit, edit, now):
@@ -51,11 +52,11 @@ def show(visit, edit, now):
 
 def test_places_are_on_a_circle_in_the_slice_around_the_obstacle_and_none_comes_twice():
     task = TASKS["draw_s"]()
-    places = load.places_of(task, 3, 500)
+    places = places_of(task, 3, 500)
     offset = np.array(places) - task.obstacle_position
-    np.testing.assert_allclose(np.linalg.norm(offset, axis=1), load.SETTINGS.radius, rtol=1e-3)
+    np.testing.assert_allclose(np.linalg.norm(offset, axis=1), SETTINGS.radius, rtol=1e-3)
     np.testing.assert_allclose(offset @ np.cross(*task.slice.axes.T), 0, atol=1e-12)
-    assert len(set(places) | set(load.places_of(task, 4, 500))) == 1000
+    assert len(set(places) | set(places_of(task, 4, 500))) == 1000
 
 
 def test_a_picture_answers_the_edit_of_its_place_and_only_new_answers_count(visit):
@@ -83,7 +84,7 @@ def test_an_edit_is_answered_by_a_picture_of_it_or_of_a_later_one_in_time(visit)
     assert visit.answered == pytest.approx(2 / 4)
     show(visit, 3, 5.81)
     assert visit.answered == pytest.approx(2 / 4)
-    assert load.Visit(visit.client).answered is None
+    assert Visit(visit.client).answered is None
 
 
 def test_in_a_lecture_a_quarter_drags_and_one_in_twenty_changes_the_task():
@@ -110,7 +111,7 @@ def test_who_is_lost_saw_nothing_for_the_rest_of_the_drag(visit):
     figures = visit.figures(10.0)
     assert figures["pictures_per_s"] == pytest.approx(0.1) and figures["gap_ms"]["worst"] == pytest.approx(9650.0)
     assert not figures["last_shown"]
-    nothing = load.Visit(visit.client, lost="before the first edit").figures(10.0)
+    nothing = Visit(visit.client, lost="before the first edit").figures(10.0)
     assert nothing["pictures_per_s"] == 0 and nothing["gap_ms"]["worst"] == pytest.approx(1e4)
 
 
@@ -125,7 +126,7 @@ def test_all_visitors_who_come_and_drag_at_once_are_shown_their_last_edit(tmp_pa
         assert 0 < visits["ping_ms"]["median"] <= visits["ping_ms"]["p95"] <= visits["ping_ms"]["worst"]
         for visitor in visits["visitors"]:
             assert visitor["last_shown"] and not visitor["lost"]
-            assert 0 <= visitor["pictures_per_s"] <= load.SETTINGS.edits_per_second
+            assert 0 <= visitor["pictures_per_s"] <= SETTINGS.edits_per_second
             assert 0 < visitor["latency_ms"]["median"] <= visitor["latency_ms"]["p95"]
     assert figures["unit_ms"] > 0
     assert f"{NUM_VISITORS} of {NUM_VISITORS}" in capsys.readouterr().out
@@ -141,7 +142,7 @@ def test_who_gives_way_is_chosen_and_visitors_of_a_started_server_who_look_on_co
 
 
 def test_who_gets_no_picture_in_time_fails_the_measurement(monkeypatch, capsys, url):
-    monkeypatch.setattr(load, "SETTINGS", load.LoadSettings(first_picture=0.0, settled=0.0))
+    monkeypatch.setattr(load, "SETTINGS", LoadSettings(first_picture=0.0, settled=0.0))
     assert main(["load", "--clients", "1", "--seconds", "1", "--url", url]) == 1
 
 
