@@ -85,12 +85,14 @@ def _serve(options: argparse.Namespace) -> int:
             print(f"{PROG}: --task: found {begin!r}; accepted: {', '.join(tasks)}", file=sys.stderr)
             return 2
         fits = FitStore(default_cache_folder())
-        if options.prepare_all:
+        if options.prepare_all or options.prepare_only:
             for name in tasks:
                 task = tasks[name]()
                 fits.get(task.demonstrations, progress=_Bar(f"Learning {task.title}"))
                 print(f"Ready: {task.title}", flush=True)
             _compile(robot, threading.Event())
+        if options.prepare_only:
+            return 0
         listening = listen(options.host, options.port)
     except (DataError, ImitationError, AddressError, FileNotFoundError) as error:
         print(f"{PROG}: {error}", file=sys.stderr)
@@ -249,6 +251,9 @@ def _parser() -> argparse.ArgumentParser:
         "--prepare-all",
         action="store_true",
         help="learn every task before the first visitor comes, not when it is chosen",
+    )
+    parser.add_argument(
+        "--prepare-only", action="store_true", help="the same, and end: all is in the cache folder, as for an image"
     )
     parser.add_argument("--lasa", type=Path, metavar="DIR", help="folder of LASA .mat files, each becomes a task")
     parser.add_argument(

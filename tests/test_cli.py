@@ -84,6 +84,9 @@ def test_every_task_is_learned_before_it_is_ready_if_asked_with_a_line_for_each(
     printed, errors = capsys.readouterr()
     assert re.findall("Ready: (.*)", printed) == [entry.title for entry in TASKS.values()]
     assert "it would be ready" in errors
+    learned.clear()
+    assert main(["--prepare-only"]) == 0
+    assert len(learned) == len(TASKS)
 
 
 def test_own_files_are_the_task_that_the_page_begins_with(monkeypatch, tmp_path, capsys):

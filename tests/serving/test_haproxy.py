@@ -88,12 +88,15 @@ def test_one_server_is_drained_and_one_is_killed(cache):
         origin = f"http://127.0.0.1:{port}"
         servers = [stack.enter_context(started(cache, "--processes", "1", "--allow-origin", origin)) for _ in range(2)]
         text = CONFIGURATION.read_text().replace("/tmp/haproxy.sock", str(control))
-        text = text.replace("bind 127.0.0.1:8080", f"bind 127.0.0.1:{port}")
         for number, server in zip((8081, 8082), servers, strict=True):
             text = text.replace(f" 127.0.0.1:{number}", f" {address(server).removeprefix('ws://')}")
         (folder / "haproxy.cfg").write_text(text)
         proxy = stack.enter_context(
-            subprocess.Popen([HAPROXY, "-f", str(folder / "haproxy.cfg")], stderr=subprocess.PIPE)
+            subprocess.Popen(
+                [HAPROXY, "-f", str(folder / "haproxy.cfg")],
+                env=os.environ | {"BIND": f"127.0.0.1:{port}"},
+                stderr=subprocess.PIPE,
+            )
         )
         stack.callback(proxy.kill)
         asyncio.run(visit(f"ws://127.0.0.1:{port}", control, servers))
