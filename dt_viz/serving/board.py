@@ -37,9 +37,8 @@ class Board:
         row = np.dtype(
             [
                 ("beat", float),  # time of `time.monotonic` when its event loop was last known to run
-                ("waits", float),  # the same when the first of those who wait for a place came; `NEVER` without any
                 ("visitors", np.int64),  # visitors with a place
-                ("waiting", np.int64),  # visitors who wait for one
+                ("came", float, num_connections),  # when each of those who wait for one came; `NEVER` for none
                 ("is_prepared", np.int64),
                 ("is_closing", np.int64),
                 ("connections", np.int64, num_connections),  # digest of the address of each connection; 0 for none
@@ -54,7 +53,7 @@ class Board:
 
     def clear(self, number: int) -> None:
         """Empty the row of a process that has ended, or that begins now."""
-        self.rows[number] = (time.monotonic(), NEVER, 0, 0, 0, 0, 0)
+        self.rows[number] = (time.monotonic(), 0, NEVER, 0, 0, 0)
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -90,7 +89,11 @@ class Share:
     @property
     def num_waiting(self) -> int:
         """Number of visitors who wait for a place, in all processes."""
-        return int(self._board.rows["waiting"].sum())
+        return int(np.isfinite(self._board.rows["came"]).sum())
+
+    def num_before(self, came: float) -> int:
+        """Return the number of visitors, in all processes, who have waited for longer than who came then."""
+        return int((self._board.rows["came"] < came).sum())
 
     @property
     def is_closing(self) -> bool:
@@ -117,14 +120,14 @@ class Share:
     def seat(self, num_visitors: int, waiting: list[float]) -> None:
         """Tell how many visitors there are here, and when those who wait came, seconds of `time.monotonic`."""
         self._row["visitors"] = num_visitors
-        self._row["waiting"] = len(waiting)
-        self._row["waits"] = min(waiting, default=NEVER)
+        came = self._row["came"][0]
+        came[: len(waiting)], came[len(waiting) :] = waiting, NEVER
 
     @contextmanager
     def next_place(self, num_places: int) -> Iterator[bool]:
         """Yield whether who waits longest here has the next place; until it is told who takes it, no other may."""
         with self._board.locked():
-            is_first = self._row["waits"][0] <= self._board.rows["waits"].min()
+            is_first = self._row["came"].min() <= self._board.rows["came"].min()
             yield is_first and self.num_visitors < num_places
 
     def num_connections(self, address: str | None = None) -> int:

@@ -74,6 +74,8 @@ HEALTH = "/health"
 VERSION = version("dt-viz")
 BEAT = 0.25
 """Time after which a process tells again that its event loop runs, seconds."""
+LAST_WORDS = 0.5
+"""Time until a connection is ended, in which its client is sent the reason, seconds."""
 
 Answer = Callable[[ServerConnection, Request], Response | None]
 """Callback that answers a request, or returns None to let it become a connection."""
@@ -178,6 +180,8 @@ class _Connection(ServerConnection):
     def __init__(self, gate: Gate, *arguments: Any, **options: Any) -> None:  # noqa: ANN401 - of websockets
         super().__init__(*arguments, **options)
         self.upload = Upload(gate.limits.upload)
+        self.active = time.monotonic()
+        """When it sent the last message, seconds."""
         self._gate = gate
         self._second, self._num_received = 0.0, 0
 
@@ -197,6 +201,7 @@ class _Connection(ServerConnection):
             await self._keep_pace()
             try:
                 if self._gate.passes(self, raw):
+                    self.active = time.monotonic()
                     return raw
             except MalformedError:
                 logger.warning("a connection is closed: it sent what no page sends")
@@ -263,9 +268,9 @@ class Gate:
 
     def _guarded(self, handler: Any, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:  # noqa: ANN401
         """Put the gate between websockets and viser's handler of connections."""
-        loop = asyncio.get_running_loop()
-        loop.set_exception_handler(_report_loop)
-        self._beat(loop)
+        self._loop = asyncio.get_running_loop()
+        self._loop.set_exception_handler(_report_loop)
+        self._beat()
         return partial(self._handle, handler), {
             **options,
             "process_request": partial(self._answer, options["process_request"]),
@@ -273,10 +278,22 @@ class Gate:
             "max_size": self.limits.image,
         }
 
-    def _beat(self, loop: asyncio.AbstractEventLoop) -> None:
+    def _beat(self) -> None:
         """Tell again and again that the event loop runs."""
         self._share.beat()
-        loop.call_later(BEAT, self._beat, loop)
+        self._loop.call_later(BEAT, self._beat)
+
+    def idle(self, client: viser.ClientHandle) -> float:
+        """Return the time since a client sent something, seconds; 0 if it has left."""
+        connection = None if self._server is None else patches.connection_of(self._server, client.client_id)
+        return 0.0 if connection is None else time.monotonic() - connection.active
+
+    def disconnect(self, client: viser.ClientHandle) -> None:
+        """End the connection of a client when it has been sent what it was told; its page comes again by itself."""
+        connection = None if self._server is None else patches.connection_of(self._server, client.client_id)
+        if connection is not None:
+            connection.active = time.monotonic()  # once is enough
+            asyncio.run_coroutine_threadsafe(_closed(connection), self._loop)
 
     def _answer(self, answer: Answer, connection: ServerConnection, request: Request) -> Response | None:
         refusal = self._refusal(connection, request)
@@ -380,6 +397,11 @@ def _strict(name: str) -> type[msgspec.Struct]:
         for one in dataclasses.fields(declared)
     ]
     return msgspec.defstruct(name, fields, tag_field="type", tag=name, forbid_unknown_fields=True)
+
+
+async def _closed(connection: ServerConnection) -> None:
+    await asyncio.sleep(LAST_WORDS)
+    await connection.close()
 
 
 def _report_loop(_loop: asyncio.AbstractEventLoop, context: Mapping[str, Any]) -> None:

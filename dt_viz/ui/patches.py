@@ -91,6 +91,11 @@ def client_of(server: viser.ViserServer, connection: Any) -> viser.ClientHandle 
     return server.get_clients().get(ids[0]) if ids else None
 
 
+def connection_of(server: viser.ViserServer, client_id: int) -> Any:  # noqa: ANN401 - of websockets
+    """Return the connection of a client; None if it has left. Hook: `ClientHandle.connection`."""
+    return server._websock_server._live_connections.get(client_id)
+
+
 def name_of(handle: Any) -> str:  # noqa: ANN401
     """Return the name of a control in the page. Hook: `handle.uuid`."""
     return handle._impl.uuid

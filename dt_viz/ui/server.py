@@ -29,6 +29,10 @@ logger = logging.getLogger(__name__)
 
 MAX_WAITING = 8
 """Largest number of visitors who wait for a place, unless it is chosen."""
+IDLE = 600.0
+"""Time after which a visitor who does nothing gives his place to one who waits, seconds."""
+LEAVING = "Others wait for a place, and you have done nothing for a while: you are in line again."
+"""What he is told."""
 CLOSING = "The server ends. This page opens again by itself when it is back."
 """What visitors are told when it ends."""
 
@@ -110,7 +114,29 @@ class Server:
         """
         while True:
             time.sleep(0.5)
-            self._admit()  # a place may be free in another process
+            self.attend()
+
+    def attend(self) -> None:
+        """See to those who wait: a place may be free in another process, or taken by somebody who does nothing."""
+        self._admit()
+        with self._lock:
+            for _, said, came in self._waiting.values():
+                if said is not None:
+                    said.content = self._full(came)
+        if self._share.num_waiting and self._share.num_visitors >= self._max_sessions:
+            quietest = max(self.visitors, key=lambda visitor: self.gate.idle(visitor.client), default=None)
+            if quietest is not None and self.gate.idle(quietest.client) > IDLE:
+                notify(quietest.client, LEAVING, COLOURS[Severity.WARNING][0])
+                self.gate.disconnect(quietest.client)
+
+    def _full(self, came: float) -> str:
+        """Return what somebody who came then is told while all places are taken."""
+        num_before = self._share.num_before(came)
+        line = f"**{num_before} before you.** " if num_before else "**You are next.** "
+        return (
+            f"**All {self._max_sessions} places are taken.** {line}This page opens by itself when a place is free: "
+            "close another tab of this demo, or wait. Whoever runs the server can allow more with `--max-sessions`."
+        )
 
     def close(self) -> None:
         """Close all pages and stop listening."""
@@ -132,12 +158,9 @@ class Server:
         with self._lock:
             if self._closed or client.client_id not in self._server.get_clients():
                 return  # left before its turn came
-            full = (
-                f"**All {self._max_sessions} places are taken.** This page opens by itself when a place is free: close "
-                "another tab of this demo, or wait. Whoever runs the server can allow more with `--max-sessions`."
-            )
-            said = client.gui.add_markdown(full) if self._share.num_visitors >= self._max_sessions else None
-            self._waiting[client.client_id] = client, said, time.monotonic()
+            came, is_full = time.monotonic(), self._share.num_visitors >= self._max_sessions
+            said = client.gui.add_markdown(self._full(came)) if is_full else None
+            self._waiting[client.client_id] = client, said, came
             self._tell()
         self._admit()
 

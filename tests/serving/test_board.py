@@ -44,6 +44,7 @@ def test_the_next_place_is_for_who_has_waited_longest_wherever(shares):
     first, second, third = shares
     first.seat(1, [5.0, 6.0])
     second.seat(0, [3.0])
+    assert [first.num_before(came) for came in (3.0, 5.0, 6.0)] == [0, 1, 2]
     for share, expected in ((first, False), (second, True), (third, False)):
         with share.next_place(2) as is_free:
             assert is_free == expected
@@ -51,6 +52,7 @@ def test_the_next_place_is_for_who_has_waited_longest_wherever(shares):
     with first.next_place(2) as is_free:
         assert not is_free  # all places are taken
     assert (third.num_visitors, third.num_waiting) == (2, 2)
+    assert [third.num_before(came) for came in (5.0, 6.0)] == [0, 1]
     second.seat(0, [])
     with first.next_place(2) as is_free:
         assert is_free

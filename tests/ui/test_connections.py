@@ -27,6 +27,7 @@ from dt_viz.scenario.tasks import TASKS
 from dt_viz.serving.listening import listen
 from dt_viz.session.progress import Pace
 from dt_viz.ui import gate
+from dt_viz.ui import server as server_module
 from dt_viz.ui.origins import Origin
 from dt_viz.ui.panel import MAX_UPLOAD
 from dt_viz.ui.patches import GateError
@@ -208,8 +209,11 @@ async def test_no_address_takes_all_of_them(url, server, monkeypatch):
 
 @asynchronous
 async def test_who_waits_is_told_so_and_has_the_next_place_that_is_free(url, server):
+    def says(client, text):
+        return any(text in str(control) for control in client.controls.values())
+
     def waits(client):
-        return any("places are taken" in str(control) for control in client.controls.values())
+        return says(client, "places are taken")
 
     async with AsyncExitStack() as stack:
         seated, waiting = ([Client(url) for _ in range(number)] for number in (NUM_PLACES, 3))
@@ -220,11 +224,39 @@ async def test_who_waits_is_told_so_and_has_the_next_place_that_is_free(url, ser
             await (await stack.enter_async_context(client)).look()
             assert await client.wait_for(lambda c=client: waits(c), PATIENCE)
         gone, first, last = waiting
+        server.attend()
+        assert await last.wait_for(lambda: says(last, "2 before you"), PATIENCE)
+        assert says(gone, "You are next")
         await gone.__aexit__(None, None, None)
         await come_true(lambda: len(server._server.get_clients()) == NUM_PLACES + 2)
+        await come_true(lambda: server.attend() or says(last, "1 before you"))
         await seated[0].__aexit__(None, None, None)
         assert await first.wait_for(lambda: first.has_picture, PATIENCE)
         assert not waits(first) and waits(last) and len(server.visitors) == NUM_PLACES
+
+
+@asynchronous
+async def test_who_does_nothing_gives_his_place_to_one_who_waits_and_only_then(url, server, monkeypatch):
+    monkeypatch.setattr(server_module, "IDLE", 1.0)
+    async with AsyncExitStack() as stack:
+        idle, busy, waiting = [Client(url) for _ in range(NUM_PLACES + 1)]
+        for client in (idle, busy):
+            await (await stack.enter_async_context(client)).look()
+        await come_true(lambda: len(server.visitors) == NUM_PLACES)
+        await asyncio.sleep(1.2)
+        server.attend()
+        assert not await idle.wait_for(lambda: idle.lost, 0.5)  # nobody waits
+        await (await stack.enter_async_context(waiting)).look()
+        assert await waiting.wait_for(lambda: waiting.controls, PATIENCE)
+        await busy.look()
+        assert await answers(busy)
+        server.attend()
+        with pytest.raises(LostError):
+            await idle.wait_for(lambda: False, PATIENCE)
+        assert server_module.LEAVING in idle.notices
+        assert await waiting.wait_for(lambda: waiting.has_picture, PATIENCE)
+        server.attend()
+        assert not busy.lost and len(server.visitors) == NUM_PLACES
 
 
 @asynchronous
