@@ -135,18 +135,23 @@ def _cluster(address: str) -> Iterator[Parallel]:
     from distributed import Client  # noqa: PLC0415 - an extra
     from joblib import Parallel  # noqa: PLC0415
 
-    if "://" not in address:
-        raise FormatError("--dask", repr(address), CLUSTER)
-    try:
-        client = Client(address, timeout=PATIENCE, set_as_default=False)
-    except (OSError, ValueError, asyncio.TimeoutError) as error:
+    try:  # a client that has not connected would hold up the end of this process
+        asyncio.run(_greet(address))
+    except (OSError, ValueError, TypeError, MemoryError, asyncio.TimeoutError) as error:
         raise FormatError("--dask", f"{address!r}, where no scheduler answers ({_line(error)})", CLUSTER) from error
-    with client:
+    with Client(address, timeout=PATIENCE, set_as_default=False) as client:
         try:
             client.wait_for_workers(1, PATIENCE)
         except (OSError, asyncio.TimeoutError) as error:
             raise FormatError("--dask", f"{address!r}, which has no workers", CLUSTER) from error
         yield Parallel(backend=_backend(client), **SETTINGS)
+
+
+async def _greet(address: str) -> None:
+    """Connect to a scheduler and leave; the error is of any kind if another program answers."""
+    from distributed.comm import connect  # noqa: PLC0415 - an extra
+
+    await (await asyncio.wait_for(connect(address, timeout=PATIENCE), 2 * PATIENCE)).close()
 
 
 def _backend(client: Client) -> Any:  # noqa: ANN401 - joblib's
