@@ -135,10 +135,8 @@ def _cluster(address: str) -> Iterator[Parallel]:
     from distributed import Client  # noqa: PLC0415 - an extra
     from joblib import Parallel  # noqa: PLC0415
 
-    try:  # a client that has not connected would hold up the end of this process
-        asyncio.run(_greet(address))
-    except (OSError, ValueError, TypeError, MemoryError, asyncio.TimeoutError) as error:
-        raise FormatError("--dask", f"{address!r}, where no scheduler answers ({_line(error)})", CLUSTER) from error
+    if error := _unanswered(address):
+        raise FormatError("--dask", f"{address!r}, where no scheduler answers ({_line(error)})", CLUSTER)
     with Client(address, timeout=PATIENCE, set_as_default=False) as client:
         try:
             client.wait_for_workers(1, PATIENCE)
@@ -147,11 +145,29 @@ def _cluster(address: str) -> Iterator[Parallel]:
         yield Parallel(backend=_backend(client), **SETTINGS)
 
 
-async def _greet(address: str) -> None:
-    """Connect to a scheduler and leave; the error is of any kind if another program answers."""
+def _unanswered(address: str) -> Exception | None:
+    """Connect to a scheduler and leave; return what went wrong.
+
+    A client that cannot connect would hold up the end of this process, and a server of another kind `connect` itself.
+    """
     from distributed.comm import connect  # noqa: PLC0415 - an extra
 
-    await (await asyncio.wait_for(connect(address, timeout=PATIENCE), 2 * PATIENCE)).close()
+    found: list[Exception | None] = []
+
+    async def greet() -> None:
+        await (await connect(address, timeout=PATIENCE)).close()
+
+    def try_it() -> None:
+        try:
+            asyncio.run(greet())
+            found.append(None)
+        except Exception as error:  # of any kind where another program answers
+            found.append(error)
+
+    thread = threading.Thread(target=try_it, daemon=True)
+    thread.start()
+    thread.join(PATIENCE + 1)
+    return found[0] if found else TimeoutError("another program")
 
 
 def _backend(client: Client) -> Any:  # noqa: ANN401 - joblib's
