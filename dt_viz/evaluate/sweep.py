@@ -150,7 +150,7 @@ def _unanswered(address: str) -> Exception | None:
 
     A client that cannot connect would hold up the end of this process, and a server of another kind `connect` itself.
     """
-    from distributed.comm import connect  # noqa: PLC0415 - an extra
+    from distributed.comm.core import connect  # noqa: PLC0415 - an extra
 
     found: list[Exception | None] = []
 
