@@ -16,7 +16,16 @@ OF_POOLS = re.compile(
 PROC = Path("/proc")
 WATCHED = (Path.cwd(), Path.cwd() / "assets", Path.cwd() / "dt_viz")
 """Folders in which no test may make a file."""
-HARMLESS = {".hypothesis", ".pytest_cache", ".ruff_cache", "__pycache__", "dconf", "matplotlib", "fontconfig"}
+HARMLESS = {
+    "dask-scratch-space",
+    ".hypothesis",
+    ".pytest_cache",
+    ".ruff_cache",
+    "__pycache__",
+    "dconf",
+    "matplotlib",
+    "fontconfig",
+}
 OF_PYTEST = "pytest-of-"
 """Beginning of the name of the folder in which pytest makes `tmp_path`."""
 
