@@ -9,12 +9,23 @@ from pathlib import Path
 
 PATIENCE = 20.0
 """Seconds in which what was told to end may end; reached only by what would never end."""
-OF_POOLS = re.compile(r"ThreadPoolExecutor|asyncio_\d|Thread-\d+ \(_do_work\)|pytest|execnet|hypothesis|playwright")
+OF_POOLS = re.compile(
+    r"ThreadPoolExecutor|asyncio_\d|Dask-Offload|Thread-\d+ \(_do_work\)|pytest|execnet|hypothesis|playwright"
+)
 """Names of threads that a pool starts when it first needs one; a pool ends with the server that owns it."""
 PROC = Path("/proc")
 WATCHED = (Path.cwd(), Path.cwd() / "assets", Path.cwd() / "dt_viz")
 """Folders in which no test may make a file."""
-HARMLESS = {".hypothesis", ".pytest_cache", ".ruff_cache", "__pycache__", "dconf", "matplotlib", "fontconfig"}
+HARMLESS = {
+    "dask-scratch-space",
+    ".hypothesis",
+    ".pytest_cache",
+    ".ruff_cache",
+    "__pycache__",
+    "dconf",
+    "matplotlib",
+    "fontconfig",
+}
 OF_PYTEST = "pytest-of-"
 """Beginning of the name of the folder in which pytest makes `tmp_path`."""
 

@@ -48,6 +48,8 @@ ONLY_IMPORTERS: Mapping[str, set[str]] = {
     "matplotlib": {"examples/plot.py", "evaluate/figures.py"},
     "torch": {"baselines/eflow_training.py"},
     "ompl": {"baselines/mpnet_rrt.py"},
+    "joblib": {"evaluate/sweep.py"},
+    "distributed": {"evaluate/sweep.py"},
     "jax": set(),
     "numba": {"kernels/compiled.py"},
     "pickle": {"kernels/compiled.py"},

@@ -9,6 +9,8 @@ from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 
+from dt_viz.evaluate import THREADS
+
 BAD_INPUT = 2
 """Exit status for what the user can put right; argparse uses the same."""
 COMMANDS = ("imitation", "around", "reactive", "arms", "table1", "train", "load")
@@ -49,8 +51,8 @@ def run_command(package: str, commands: Sequence[str], arguments: Sequence[str],
         arguments: name and options of the command.
         prog: name of the program in messages.
     """
-    # numerical libraries read these when they are first imported; one thread is how the figures compare
-    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    # before numpy is imported; one thread is how the figures compare
+    for variable in THREADS:
         os.environ.setdefault(variable, "1")
     from dt_viz.errors import DataError, FormatError  # noqa: PLC0415
     from dt_viz.evaluate.options import (  # noqa: PLC0415

@@ -33,6 +33,7 @@ import argparse
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -45,14 +46,15 @@ from dt_viz.evaluate.options import (
     add_task,
     avoiding,
     chosen_task,
+    engine_of,
     interval,
-    new_engine,
     number,
     point,
     report,
     whole_number,
     write_npz,
 )
+from dt_viz.evaluate.sweep import add_workers, sweep
 from dt_viz.flows.fields import Array
 from dt_viz.flows.rollouts import refined
 from dt_viz.metrics import interpolate, maximum_collision_distance, sharpest_turn
@@ -151,16 +153,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     generator = "probability is the paper's (default: %(default)s)"
     parser.add_argument("--generator", choices=GENERATORS, default=GENERATORS[0], help=generator)
     parser.add_argument("--no-avoidance", action="store_true", help="leave the obstacle's transforms out")
+    add_workers(parser)
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the command; 1 if the one obstacle that was asked for leaves no motion."""
-    tasks, task = chosen_task(options)
-    engine = new_engine(tasks)
+    _, task = chosen_task(options)
+    chosen = {"space": options.space, "generator": options.generator}
+    avoided = [Avoidance(obstacles, **chosen) for obstacles in _obstacles(task, options)]
     try:
-        chosen = {"space": options.space, "generator": options.generator}
-        avoided = (Avoidance(obstacles, **chosen) for obstacles in _obstacles(task, options))
-        places = [measured(engine, task, avoidance, on=not options.no_avoidance) for avoidance in avoided]
+        with sweep(options, partial(engine_of, task)) as (engine, swept):
+            places = [*swept(_measured, [(task.name, avoidance, not options.no_avoidance) for avoidance in avoided])]
     except UnreachableError as error:
         print(f"no motion: the arm cannot reach the starts: {error}", file=sys.stderr)
         return 1
@@ -188,6 +191,12 @@ def run(options: argparse.Namespace) -> int:
             print(f"warning: {warning}")
     report([*_shares(places)])
     return 0
+
+
+def _measured(engine: Engine, case: tuple[str, Avoidance, bool]) -> Place:
+    """Measure a task, by name, around an avoidance's obstacles, which is on or off."""
+    task, avoidance, on = case
+    return measured(engine, engine.task(task), avoidance, on=on)
 
 
 def measured(engine: Engine, task: Task, avoidance: Avoidance, *, on: bool = True) -> Place:

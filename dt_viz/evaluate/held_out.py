@@ -13,7 +13,7 @@ The demonstrations of a shape are divided into folds; those of a fold are held o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,24 +67,35 @@ def follow(demonstrations: Sequence[Demonstration], learn: Learn, folds: int) ->
     Raises:
         ImitationError: nothing can be learned from the others.
     """
+    parts = [follow_held(demonstrations, learn, held) for held in folds_of(len(demonstrations), folds)]
+    return in_order(parts)
+
+
+def follow_held(demonstrations: Sequence[Demonstration], learn: Learn, held: range) -> dict[int, Followed]:
+    """Follow the demonstrations of one fold, by number, in each of `WAYS`; see `follow`."""
     followed: dict[int, Followed] = {}
-    for held in folds_of(len(demonstrations), folds):
-        others = [d for i, d in enumerate(demonstrations) if i not in held]
-        imitation = learn(others)
-        paths = np.stack([resample_by_arc_length(d.positions, NUM_COMPARED) for d in others])
-        progress, durations = np.stack([_progress(d) for d in others]), [d.times[-1] - d.times[0] for d in others]
-        for i in held:
-            start = demonstrations[i].positions[0]
-            nearest = int(np.linalg.norm(paths[:, 0] - start, axis=1).argmin())
-            (rollout,), (times,) = rollouts_from(imitation, start[None])
-            motions = {
-                "learned": (rollout, times),
-                "mean": _shifted(start, paths.mean(axis=0), progress.mean(axis=0), float(np.mean(durations))),
-                "nearest": _shifted(start, paths[nearest], progress[nearest], durations[nearest]),
-            }
-            degrees = degrees_off(imitation, others, demonstrations[i])
-            followed[i] = Followed(demonstrations[i], imitation.state, motions, degrees)
-    return [followed[i] for i in range(len(demonstrations))]
+    others = [d for i, d in enumerate(demonstrations) if i not in held]
+    imitation = learn(others)
+    paths = np.stack([resample_by_arc_length(d.positions, NUM_COMPARED) for d in others])
+    progress, durations = np.stack([_progress(d) for d in others]), [d.times[-1] - d.times[0] for d in others]
+    for i in held:
+        start = demonstrations[i].positions[0]
+        nearest = int(np.linalg.norm(paths[:, 0] - start, axis=1).argmin())
+        (rollout,), (times,) = rollouts_from(imitation, start[None])
+        motions = {
+            "learned": (rollout, times),
+            "mean": _shifted(start, paths.mean(axis=0), progress.mean(axis=0), float(np.mean(durations))),
+            "nearest": _shifted(start, paths[nearest], progress[nearest], durations[nearest]),
+        }
+        degrees = degrees_off(imitation, others, demonstrations[i])
+        followed[i] = Followed(demonstrations[i], imitation.state, motions, degrees)
+    return followed
+
+
+def in_order(parts: Iterable[Mapping[int, Followed]]) -> list[Followed]:
+    """What folds have followed, in the order of the demonstrations."""
+    followed = {i: found for part in parts for i, found in part.items()}
+    return [followed[i] for i in sorted(followed)]
 
 
 def degrees_off(

@@ -27,9 +27,10 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from statistics import geometric_mean
 from typing import Any
@@ -39,8 +40,19 @@ import numpy as np
 from dt_viz.errors import FormatError
 from dt_viz.evaluate import figures
 from dt_viz.evaluate.figures import FigurePanel
-from dt_viz.evaluate.held_out import WAYS, Followed, Learn, degrees_off, follow, frechet, rollouts_from
+from dt_viz.evaluate.held_out import (
+    WAYS,
+    Followed,
+    Learn,
+    degrees_off,
+    folds_of,
+    follow_held,
+    frechet,
+    in_order,
+    rollouts_from,
+)
 from dt_viz.evaluate.options import FOLDER, report, whole_number, write_json, write_npz
+from dt_viz.evaluate.sweep import add_workers, sweep
 from dt_viz.files.archives import LASA_UNITS
 from dt_viz.flows.diffeomorphisms import min_det_jacobian, round_trip_error
 from dt_viz.flows.fields import Array
@@ -85,13 +97,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--leave-one-out", action="store_true", help="also follow each by what the others teach")
     folds = "the same, but hold out in so many folds"
     parser.add_argument("--folds", type=whole_number(2), metavar="N", help=folds)
+    add_workers(parser)
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the command; 2 if one of the shapes could not be fitted."""
     if options.state == "augmented" and options.objective != OBJECTIVES[0]:
         raise FormatError("--objective", options.objective, "none with --state augmented, whose fit has no objective")
-    learn: Learn = partial(learn_in_state, settings=ImitationSettings(options.objective), state=options.state)
     sources = _sources(options.files, options.rate, options.unit)
     holds_out = options.leave_one_out or options.folds is not None
     alone = ", ".join(str(source.path) for source in sources if len(source.demonstrations) == 1)
@@ -103,26 +115,21 @@ def run(options: argparse.Namespace) -> int:
     turns: list[dict[str, Any]] = []
     panels: list[FigurePanel] = []
     cases: list[tuple[float, FigurePanel]] = []
-    for source in sources:
-        name, began, num = source.path.stem, time.perf_counter(), len(source.demonstrations)
-        folds = min(options.folds or num, num)
-        try:
-            imitation = learn(source.demonstrations)
-            seconds = time.perf_counter() - began
-            followed = follow(source.demonstrations, learn, folds) if holds_out else []
-        except ImitationError as error:
+    for source, folds, in_sample, parts in _learned(sources, holds_out, options):
+        name = source.path.stem
+        if error := next((part for part in (in_sample, *parts) if isinstance(part, ImitationError)), None):
             print(f"{source.path}: {error}", file=sys.stderr)
             continue
-        if imitation.choice is not None:
-            print(f"{name}: {imitation.state}. {imitation.choice}")
-        for warning in imitation.warnings:
+        followed = in_order(parts)
+        if in_sample.choice:
+            print(f"{name}: {in_sample.choice}")
+        for warning in in_sample.warnings:
             print(f"{source.path}: {warning}", file=sys.stderr)
-        row, arrays, rollouts = measured(imitation, source, seconds)
-        shapes.append(row)
-        write_npz(folder / f"{name}.npz", **arrays)
-        panels.append(FigurePanel(name, {"demonstration": source.paths, "learned": rollouts}))
-        if imitation.has_orientation:
-            turns.append(turn_row(imitation, source, followed))
+        shapes.append(in_sample.row)
+        write_npz(folder / f"{name}.npz", **in_sample.arrays)
+        panels.append(FigurePanel(name, {"demonstration": source.paths, "learned": in_sample.rollouts}))
+        if in_sample.degrees:
+            turns.append(turn_row(name, in_sample.degrees, followed))
         if holds_out:
             write_npz(folder / f"{name}-held-out.npz", **_arrays(followed, source.unit))
             held_out.append(summed_up(name, folds, followed))
@@ -138,8 +145,35 @@ def run(options: argparse.Namespace) -> int:
     return 0 if len(shapes) == len(sources) else 2
 
 
+def _learned(
+    sources: Sequence[Source], holds_out: bool, options: argparse.Namespace
+) -> Iterator[tuple[Source, int, Any, Sequence[Any]]]:
+    """Each source with its number of folds, its `InSample`, and what each fold has followed; or the errors of these."""
+    folds = [min(options.folds or num, num) for num in (len(source.demonstrations) for source in sources)]
+    held = [folds_of(len(s.demonstrations), of) if holds_out else [] for s, of in zip(sources, folds, strict=True)]
+    cases = [(source, part) for source, parts in zip(sources, held, strict=True) for part in (None, *parts)]
+    learn: Learn = partial(learn_in_state, settings=ImitationSettings(options.objective), state=options.state)
+    with sweep(options, lambda: learn) as (_, swept):
+        found = swept(_measured, cases)
+        for source, of, parts in zip(sources, folds, held, strict=True):
+            yield source, of, next(found), [*islice(found, len(parts))]
+
+
+def _measured(learn: Learn, case: tuple[Source, range | None]) -> InSample | dict[int, Followed] | ImitationError:
+    """Learn from a source and follow what is learned from, or, of a fold, what is held out; an error is a result."""
+    source, held = case
+    try:
+        if held is not None:
+            return follow_held(source.demonstrations, learn, held)
+        began = time.perf_counter()
+        imitation = learn(source.demonstrations)
+        return in_sample(imitation, source, time.perf_counter() - began)
+    except ImitationError as error:
+        return error
+
+
 def _report(shapes: list[dict[str, Any]], held_out: list[dict[str, Any]], turns: list[dict[str, Any]]) -> None:
-    """Print the rows of `measured`, `summed_up` and `turn_row`, and how what was learned fares beside what is not."""
+    """Print the rows of `in_sample`, `summed_up` and `turn_row`, and how what was learned fares beside what is not."""
     print("in-sample: each rollout against the demonstration that it was learned from")
     report(_with_means(shapes))
     print(f"fit, median: {np.median([row['fit_seconds'] for row in shapes]):.2f} s")
@@ -157,10 +191,25 @@ def _report(shapes: list[dict[str, Any]], held_out: list[dict[str, Any]], turns:
         report(_with_means(turns))
 
 
-def measured(
-    imitation: AnyImitation, source: Source, fit_seconds: float
-) -> tuple[dict[str, Any], dict[str, Any], tuple[Array, ...]]:
-    """Follow all demonstrations; the row of the table, the arrays of the file, and the rollouts (T, d), metres."""
+@dataclass(frozen=True)
+class InSample:
+    """What was learned from all demonstrations of a source, followed."""
+
+    row: dict[str, Any]
+    """Row of the table."""
+    arrays: dict[str, Any]
+    """Arrays of the file."""
+    rollouts: tuple[Array, ...]
+    """(T, d) from each demonstration's start, metres."""
+    degrees: Sequence[Array]
+    """Angles from the orientation of each demonstration, see `degrees_off`; empty without orientations."""
+    choice: str
+    """State that was chosen, and why; empty where it was asked for."""
+    warnings: Sequence[str]
+
+
+def in_sample(imitation: AnyImitation, source: Source, fit_seconds: float) -> InSample:
+    """Follow all demonstrations."""
     paths, unit = source.paths, source.unit
     rollouts, times = rollouts_from(imitation, np.stack([path[0] for path in paths]))
     distances = 1e3 * frechet(list(rollouts), paths)
@@ -190,22 +239,24 @@ def measured(
         **{f"rollout_{i}": rollout / unit for i, rollout in enumerate(rollouts)},
         **{f"times_{i}": moments for i, moments in enumerate(times)},
     }
-    return row, arrays, tuple(rollouts)
+    demonstrations, turned = source.demonstrations, imitation.has_orientation
+    degrees = [degrees_off(imitation, demonstrations, each)["learned"] for each in demonstrations] if turned else []
+    choice = "" if imitation.choice is None else f"{imitation.state}. {imitation.choice}"
+    return InSample(row, arrays, tuple(rollouts), degrees, choice, imitation.warnings)
 
 
-def turn_row(imitation: AnyImitation, source: Source, followed: Sequence[Followed]) -> dict[str, float | str]:
+def turn_row(name: str, degrees: Sequence[Array], followed: Sequence[Followed]) -> dict[str, float | str]:
     """Row of the table of orientations: medians and largest angles in-sample, held out, and of the mean of the others.
 
     All over the samples of all demonstrations, degrees.
     """
-    demonstrations = source.demonstrations
-    angles = {"in_sample": [degrees_off(imitation, demonstrations, each)["learned"] for each in demonstrations]}
+    angles = {"in_sample": degrees}
     if followed:
         angles |= {"held_out": [f.degrees["learned"] for f in followed]}
         angles |= {"mean_of_others": [f.degrees["mean"] for f in followed]}
     over = {"median": np.median, "largest": np.max}
     values = {f"{title}_{name}": float(of(off)) for title, off in angles.items() for name, of in over.items()}
-    return {"name": source.path.stem, **values}
+    return {"name": name, **values}
 
 
 def _states(imitation: AnyImitation, paths: Sequence[Array]) -> Array:

@@ -69,18 +69,24 @@ def new_engine(tasks: Mapping[str, TaskEntry], arm: str = "jaco") -> Engine:
     return Engine(in_reach(tasks, robot), FitStore(default_cache_folder()), robot)
 
 
+def engine_of(task: Task) -> Engine:
+    """Return a new engine with one task."""
+    return new_engine({task.name: TaskEntry(task.title, lambda: task)})
+
+
 def avoiding(task: Task, avoidance: Avoidance, *, on: bool = True) -> Scenario:
     """Return the scenario of a task with an avoidance, switched on or off, on its imitation."""
     return Scenario(task.name, (Layer(avoidance, on, AVOIDANCE.title),))
 
 
-def whole_number(minimum: int) -> Callable[[str], int]:
-    """Return a type for argparse: a whole number of at least `minimum`, which is not negative."""
+def whole_number(minimum: int, maximum: int | None = None) -> Callable[[str], int]:
+    """Return a type for argparse: a whole number of at least `minimum`, which is not negative, and up to `maximum`."""
+    to = "or more" if maximum is None else f"to {maximum}"
 
     def convert(text: str) -> int:
         number = int(text) if text.isdecimal() else -1
-        if number < minimum:
-            raise argparse.ArgumentTypeError(f"found {text!r}; accepted: a whole number, {minimum} or more")
+        if number < minimum or (maximum is not None and number > maximum):
+            raise argparse.ArgumentTypeError(f"found {text!r}; accepted: a whole number, {minimum} {to}")
         return number
 
     return convert

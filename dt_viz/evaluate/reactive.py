@@ -17,8 +17,8 @@ import argparse
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
-from itertools import cycle
+from functools import cache, partial
+from itertools import cycle, islice
 from typing import Any
 
 import numpy as np
@@ -33,16 +33,18 @@ from dt_viz.evaluate.options import (
     as_text,
     avoiding,
     chosen_task,
-    new_engine,
+    engine_of,
     positive_number,
     report,
     whole_number,
     write_npz,
 )
+from dt_viz.evaluate.sweep import Swept, add_workers, sweep
 from dt_viz.flows.fields import Array
 from dt_viz.metrics import arc_length, interpolate, resample_by_arc_length
 from dt_viz.motion.stack import LIVE
 from dt_viz.obstacles.shapes import UPRIGHT, Box, Obstacle, Quaternion, Sphere, as_point, as_quaternion
+from dt_viz.scenario.tasks import Task
 from dt_viz.session.engine import Engine
 
 OUT = "FILE.npz"
@@ -137,6 +139,11 @@ class Bench:
         """The hand's places (T, 3), metres, and joints (T, n) at all ticks without a sphere."""
         joints = driven(ArmController(self.follower, self.solved), self.starts[start])
         return self.robot.end_effector(joints), joints
+
+
+def new_bench(task: Task, diameter: float, margin: float, *, boxes: bool) -> Bench:
+    """A bench with an engine of its own."""
+    return Bench(engine_of(task), task.name, diameter, margin, boxes=boxes)
 
 
 def driven(controller: ArmController, q: Array) -> Array:
@@ -266,34 +273,50 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--boxes", action="store_true", help="boxes of D × 0.8 D × 0.6 D, turned, not spheres")
     parser.add_argument("--diameter", type=positive_number("metres", 1), default=0.15, metavar="D", help="metres")
     parser.add_argument("--margin", type=positive_number("metres", 1), default=0.03, metavar="M", help="metres")
+    add_workers(parser)
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the subcommand."""
-    tasks, task = chosen_task(options)
-    bench = Bench(new_engine(tasks), task.name, options.diameter, options.margin, boxes=options.boxes)
+    _, task = chosen_task(options)
     arrays: dict[str, Any] = {"diameter": options.diameter}
     figures: list[dict[str, Any]] = []
-    for crossing, seconds in crossings(bench, options.speed, options.seed, options.obstacles):
-        found = simulated(bench, crossing)
-        if room_at_coming(bench, found, crossing) < SETTINGS.coming_room:
-            continue
-        i, ticks = len(figures), range(len(found.q))
-        places = np.array([crossing.at(k) for k in ticks])
-        figures.append(figures_of(bench, crossing, found, seconds))
-        arrays |= {f"q_{i}": found.q, f"t_{i}": TICK * np.array(ticks)}
-        arrays |= {f"obstacle_{i}": places[:, 0] if options.obstacles == 1 else places}
-        arrays[f"wxyz_{i}"] = crossing.wxyz
-        values = (f"{name} {as_text(value)}" for name, value in figures[i].items() if name != "ticks")
-        print(i, ", ".join(values), *sorted(phase.value for phase in found.phases), flush=True)
-        if len(figures) == options.runs:
-            break
+    make = partial(new_bench, task, options.diameter, options.margin, boxes=options.boxes)
+    with sweep(options, make) as (bench, swept):
+        for crossing, found, figures_of_run in measured(bench, swept, options):
+            i, ticks = len(figures), range(len(found.q))
+            places = np.array([crossing.at(k) for k in ticks])
+            figures.append(figures_of_run)
+            arrays |= {f"q_{i}": found.q, f"t_{i}": TICK * np.array(ticks)}
+            arrays |= {f"obstacle_{i}": places[:, 0] if options.obstacles == 1 else places}
+            arrays[f"wxyz_{i}"] = crossing.wxyz
+            values = (f"{name} {as_text(value)}" for name, value in figures[i].items() if name != "ticks")
+            print(i, ", ".join(values), *sorted(phase.value for phase in found.phases), flush=True)
     write_npz(options.out, **arrays)
     shape = "box" if options.boxes else "sphere"
     size = f"{options.obstacles} {shape}(s) of {options.diameter:g} m"
     print(f"\n{task.name}, {size} at {options.speed:g} m/s, margin {options.margin:g} m")
     report([summary(figures)])
     return 0
+
+
+def measured(bench: Bench, swept: Swept, options: argparse.Namespace) -> Iterator[tuple[Crossing, Run, dict[str, Any]]]:
+    """Run crossings, as many at a time as are still wanted, until so many had the room to come; give their figures."""
+    drawn, left = crossings(bench, options.speed, options.seed, options.obstacles), options.runs
+    while left:
+        for measured in swept(_measured, [*islice(drawn, left)]):
+            if measured is not None:
+                left -= 1
+                yield measured
+
+
+def _measured(bench: Bench, drawn: tuple[Crossing, float]) -> tuple[Crossing, Run, dict[str, Any]] | None:
+    """Run one crossing; None without room for an obstacle to come."""
+    crossing, seconds = drawn
+    found = simulated(bench, crossing)
+    if room_at_coming(bench, found, crossing) < SETTINGS.coming_room:
+        return None
+    return crossing, found, figures_of(bench, crossing, found, seconds)
 
 
 def figures_of(bench: Bench, crossing: Crossing, run: Run, seconds: float) -> dict[str, Any]:

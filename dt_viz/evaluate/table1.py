@@ -34,13 +34,15 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
+from itertools import islice
 from typing import Any
 
 import numpy as np
 
-from dt_viz.baselines.base import INSTALL, NotFittedError, Plan, Planner, Problem
+from dt_viz.baselines.base import INSTALL, Method, NotFittedError, Plan, Planner, Problem
 from dt_viz.baselines.registry import METHODS, problem_of
 from dt_viz.errors import FormatError
 from dt_viz.evaluate import figures
@@ -55,6 +57,7 @@ from dt_viz.evaluate.options import (
     write_json,
     write_npz,
 )
+from dt_viz.evaluate.sweep import Swept, add_workers, sweep
 from dt_viz.flows.fields import Array
 from dt_viz.metrics import (
     dynamic_time_warping,
@@ -134,29 +137,43 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--count", type=whole_number(1), default=10, help="places (default: %(default)s)")
     parser.add_argument("--perturbed", type=whole_number(0), default=200, help="starts (default: %(default)s)")
     parser.add_argument("--seed", type=whole_number(0), default=0, help="of the places (default: %(default)s)")
+    add_workers(parser)
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the command; 1 if a method needs what is not installed, or was not trained."""
-    folder, methods = options.out, [METHODS[name] for name in options.methods]
+    methods = [METHODS[name] for name in options.methods]
     for method in methods:
         if method.missing:
             print(f"{method.title} needs {', '.join(method.missing)}: {INSTALL}; or leave it out", file=sys.stderr)
     if any(method.missing for method in methods):
         return 1
-    engine, draws = new_engine(TASKS), figures.can_draw()
+    try:
+        with sweep(options, Fitted) as (fitted, swept):
+            _measure(fitted, swept, methods, options)
+    except NotFittedError as error:
+        print(error, file=sys.stderr)
+        return 1
+    return 0
+
+
+def _measure(fitted: Fitted, swept: Swept, methods: Sequence[Method], options: argparse.Namespace) -> None:
+    """Measure all methods at all places; write and print the results.
+
+    Raises:
+        FormatError: the places are not found.
+        NotFittedError: a method was not trained.
+    """
+    folder, draws = options.out, figures.can_draw()
     table: dict[str, dict[str, Any]] = {method.name: {} for method in methods}
-    for name in options.tasks:
-        problem = problem_of(engine.nominal(Scenario(name)).learned, engine.follower)
-        places = drawn(problem, options.count, options.perturbed, options.seed)
-        first_motions = {}
+    problems = {name: fitted.problem(name) for name in options.tasks}
+    drawn_for = {name: drawn(problems[name], options.count, options.perturbed, options.seed) for name in problems}
+    cases = [(method.name, name, place) for name in problems for method in methods for place in drawn_for[name]]
+    found = swept(_measured, cases)
+    for name, problem in problems.items():
+        places, first_motions = drawn_for[name], {}
         for method in methods:
-            try:
-                planner = method.fit(problem)
-            except NotFittedError as error:
-                print(f"{method.title}, {problem.task.title}: {error}", file=sys.stderr)
-                return 1
-            arrays = measured(planner, problem, places)
+            arrays = gathered(problem, places, [*islice(found, len(places))])
             write_npz(folder / f"{method.name}_{name}.npz", **arrays)
             table[method.name][name] = cells(method.name, name, arrays)
             x = arrays["x_0_0"]
@@ -169,7 +186,27 @@ def run(options: argparse.Namespace) -> int:
         if draws:
             files = (folder / f"figure6_{name}.{suffix}" for suffix in ("svg", "png"))
             figures.save(figures.curves(problem.task.title, first_motions), *files)
-    return 0
+
+
+class Fitted:
+    """The problems, and the methods that are fitted to them, each made when it is first asked for."""
+
+    def __init__(self) -> None:
+        self._engine = new_engine(TASKS)
+        self.problem: Callable[[str], Problem] = cache(self._problem)
+        """Problem of a task."""
+        self.planner: Callable[[str, str], Planner] = cache(self._planner)
+        """Method by name, fitted to a task; raises NotFittedError, which names both, if it was not trained."""
+
+    def _problem(self, task: str) -> Problem:
+        return problem_of(self._engine.nominal(Scenario(task)).learned, self._engine.follower)
+
+    def _planner(self, method: str, task: str) -> Planner:
+        problem = self.problem(task)
+        try:
+            return METHODS[method].fit(problem)
+        except NotFittedError as error:
+            raise NotFittedError(f"{METHODS[method].title}, {problem.task.title}: {error}") from error
 
 
 def drawn(problem: Problem, count: int, num_perturbed: int, seed: int) -> list[RandomPlace]:
@@ -213,30 +250,52 @@ def _perturbed(problem: Problem, sphere: Sphere, num: int, rng: np.random.Genera
     return np.array(found).reshape(-1, 3)
 
 
-def measured(planner: Planner, problem: Problem, places: Sequence[RandomPlace]) -> dict[str, Array]:
-    """Plan and measure the motions of a method at all places.
+@dataclass(frozen=True)
+class PlaceFigures:
+    """Motions of a method at a place, and what is measured of them."""
 
-    Returns:
-        The arrays of the method's file.
-    """
+    motions: Sequence[tuple[Array, Array, Array]]
+    """Path (N, 3), times (N,) and postures (M, n) from each start."""
+    of_motions: Sequence[Sequence[float]]
+    """`OF_MOTIONS` of each."""
+    ends: Array
+    """(P, 3) where motions from the perturbed starts end, metres."""
+    seconds: float
+
+
+def _measured(fitted: Fitted, case: tuple[str, str, RandomPlace]) -> PlaceFigures:
+    """Measure a method, by name, at a place of a task."""
+    method, task, place = case
+    return measured(fitted.planner(method, task), fitted.problem(task), place)
+
+
+def measured(planner: Planner, problem: Problem, place: RandomPlace) -> PlaceFigures:
+    """Plan and measure the motions of a method at a place."""
+    began = time.thread_time()
+    plan = planner(place.obstacle, problem.task.starts)
+    seconds = time.thread_time() - began
+    motions = [*zip(plan.paths, plan.times, joints_along(problem, plan), strict=True)]
+    compared = zip(motions, problem.task.paths, strict=True)
+    rows = [measure(problem, *motion, demonstration, place.obstacle) for motion, demonstration in compared]
+    return PlaceFigures(motions, rows, _ends(planner, place), seconds)
+
+
+def gathered(problem: Problem, places: Sequence[RandomPlace], found: Sequence[PlaceFigures]) -> dict[str, Array]:
+    """The arrays of a method's file."""
     task, goal = problem.task, problem.learned.goal
     arrays: dict[str, Array] = {f"demo_{i}": path for i, path in enumerate(task.paths)}
-    arrays |= {f"demo_t_{i}": d.times for i, d in enumerate(task.demonstrations)}
-    rows, reached, seconds = [], [], []
-    for k, place in enumerate(places):
-        began = time.thread_time()
-        plan = planner(place.obstacle, task.starts)
-        seconds.append(time.thread_time() - began)
-        for i, motion in enumerate(zip(plan.paths, plan.times, joints_along(problem, plan), strict=True)):
+    arrays |= {f"demo_t_{i}": d.times for i, d in enumerate(task.demonstrations)} | {"goal": goal}
+    reached = []
+    for k, (place, at_place) in enumerate(zip(places, found, strict=True)):
+        for i, motion in enumerate(at_place.motions):
             arrays |= {f"{name}_{k}_{i}": values for name, values in zip("xtq", motion, strict=True)}
-            rows.append(measure(problem, *motion, task.paths[i], place.obstacle))
-        ends = _ends(planner, place)
         arrays |= {f"obstacle_{k}": np.array([*place.sphere.position, place.sphere.diameter])}
-        arrays |= {f"perturbed_{k}": place.perturbed, f"ends_{k}": ends, "goal": goal}
-        near = np.linalg.norm(ends - goal, axis=1) <= SETTINGS.reached
+        arrays |= {f"perturbed_{k}": place.perturbed, f"ends_{k}": at_place.ends}
+        near = np.linalg.norm(at_place.ends - goal, axis=1) <= SETTINGS.reached
         reached.append(near.mean() if len(near) else np.nan)
-    of_motions = np.array(rows).T.reshape(len(OF_MOTIONS), len(places), -1)
-    return arrays | dict(zip(COLUMNS, (*of_motions, np.array(reached), np.array(seconds)), strict=True))
+    of_motions = np.array([at_place.of_motions for at_place in found]).transpose(2, 0, 1)
+    seconds = np.array([at_place.seconds for at_place in found])
+    return arrays | dict(zip(COLUMNS, (*of_motions, np.array(reached), seconds), strict=True))
 
 
 def measure(problem: Problem, x: Array, t: Array, q: Array, demonstration: Array, obstacle: Union) -> list[float]:
