@@ -14,6 +14,7 @@ import viser
 
 from dt_viz.flows.fields import Array
 from dt_viz.scenario.panels import TITLE_ROOM, directions
+from dt_viz.scenario.scenario import MAX_SIGHT
 from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.tasks import Task
 from dt_viz.ui import gestures
@@ -280,9 +281,7 @@ class CameraController:
 
     async def _reported(self, camera: viser.CameraHandle) -> None:
         """Take note of where the camera is: put it back, leave it, or fit the picture to a window of another size."""
-        position, look_at = (
-            gestures.vector(place, 3, gestures.MAX_SIGHT) for place in (camera.position, camera.look_at)
-        )
+        position, look_at = (gestures.vector(place, 3, MAX_SIGHT) for place in (camera.position, camera.look_at))
         if position is None or look_at is None or self._shown is None:
             return
         with self._lock:
