@@ -17,6 +17,7 @@ from dt_viz.robot.robot import Robot
 from dt_viz.scenario.tasks import TaskEntry
 from dt_viz.session.arms import ArmStore
 from dt_viz.ui.gate import Gate, Limits
+from dt_viz.ui.keeping import KEY
 from dt_viz.ui.origins import Origin, Origins
 from dt_viz.ui.panel import MAX_UPLOAD
 from dt_viz.ui.tabs.status import COLOURS
@@ -155,6 +156,7 @@ class Server:
         except Exception as error:
             logger.exception("the page of visitor %d could not be built", client.client_id)
             client.gui.add_markdown(f"**The page could not be built.** {type(error).__name__}: {error}")
+            client.local_storage.remove_item(KEY)  # it may be what it began with: it begins anew after a reload
             self._farewell(client)
             return
         with self._lock:
