@@ -182,7 +182,7 @@ class ProtocolClient:
                         await self.send("LocalStorageGetItemResponseMessage", error=None, **told)
                 self._news.set()
             self._ended = LostError("the server closed the connection")
-        except websockets.ConnectionClosed as error:
+        except (websockets.ConnectionClosed, LostError) as error:
             self._ended = error
         finally:
             self._news.set()

@@ -20,8 +20,10 @@ from dt_viz.warning import Severity
 
 KEY = "dt-viz"
 """Name of what is kept, among all that the browser keeps for pages of this address."""
-PATIENCE, LATE = 1.0, 20.0
-"""Times in which a browser must tell what it keeps, seconds: before the page opens, and while nothing is edited yet."""
+PATIENCE = 1.0
+"""Time in which a browser must tell what it keeps, seconds."""
+ATTEMPTS = 30
+"""Number of times that it is asked again after the page has opened, while nothing is edited."""
 PAUSE = 0.5
 """Shortest time between two writes, seconds."""
 LANE = "keeping"
@@ -67,8 +69,9 @@ class Keeper:
         """Text that was written last, or that needs no writing."""
         self._proven = False
         """Whether the browser was asked if it keeps what it is told."""
-        self.begun = self._read(PATIENCE)
+        self.begun: Saved | None = None
         """What the page begins with; None if it begins anew, or has begun."""
+        self._ask()
 
     def begin(self, session: Session, resume: Callable[[Saved], None]) -> None:
         """Keep what is there, from now on, when it is `changed`; `resume` takes what the browser tells late."""
@@ -79,7 +82,7 @@ class Keeper:
         if BLOCKED not in trouble:
             self._session = session
         if SLOW in trouble:
-            session.jobs.submit(LANE, partial(self._resume, resume))
+            session.jobs.submit(LANE, partial(self._ask_again, session, resume))
 
     def sight(self, frame: Frame) -> Sight | None:
         """Return where the camera begins with a frame; None where its task says it."""
@@ -100,24 +103,30 @@ class Keeper:
         if self._session is not None:
             self._session.jobs.submit(LANE, self._remove, latest=True)
 
-    def _read(self, seconds: float) -> Saved | None:
+    def _ask(self) -> bool:
+        """Ask the browser what it keeps, which then is `begun`; return whether it has answered."""
         try:
-            self._found = self._storage.get_item(KEY, timeout=seconds)
-            return None if self._found is None else decode(self._found, self._known, "What this browser keeps")
+            self._found = self._storage.get_item(KEY, timeout=PATIENCE)
+            if self._found is not None:
+                self.begun = decode(self._found, self._known, "What this browser keeps")
+        except TimeoutError:
+            self._say(SLOW)
+            return False
+        except RuntimeError:
+            self._say(BLOCKED)
         except DataError as error:
             self._storage.remove_item(KEY)
             self._say(f"The page begins anew. {error}")
-        except TimeoutError:
-            self._say(SLOW)
-        except RuntimeError:
-            self._say(BLOCKED)
-        return None
+        return True
 
-    def _resume(self, resume: Callable[[Saved], None]) -> None:
-        saved = self._read(LATE)
-        if saved is not None and self._text() == self._written:
-            self.begun = saved
-            resume(saved)
+    def _ask_again(self, session: Session, resume: Callable[[Saved], None]) -> None:
+        told, attempts = False, ATTEMPTS
+        while attempts and not told and not session.jobs.superseded(LANE):
+            told, attempts = self._ask(), attempts - 1
+        if self.begun is not None and session.jobs.superseded(LANE):  # it was edited, or the visitor has left
+            self.begun = None
+        elif self.begun is not None:
+            resume(self.begun)
 
     def _write(self, session: Session) -> None:
         text = self._text()
