@@ -10,7 +10,7 @@ from pages import all_of
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.ui.visitor import Visitor
 
-PATIENCE = 60.0
+PATIENCE = 240.0
 """Seconds after which a test gives up; nothing takes that long, even on a machine that has other work."""
 TRIES = 8
 """Drags or clicks until the page, which may still be on its way to what was asked of it, has taken one."""
