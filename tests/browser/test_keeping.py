@@ -32,7 +32,7 @@ pytestmark = [pytest.mark.browser, needs_chromium]
 
 APP = Path(dt_viz.__file__).parent.parent / "app.py"
 STORED = "Object.keys(localStorage).find(key => key.endsWith('dt-viz'))"
-FULL = "Storage.prototype.setItem = () => { throw new DOMException('full', 'QuotaExceededError'); }"
+FULL = "() => { Storage.prototype.setItem = () => { throw new DOMException('full', 'QuotaExceededError'); }; }"
 """Makes a page that has no room left to keep anything."""
 
 
