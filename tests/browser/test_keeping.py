@@ -32,8 +32,6 @@ pytestmark = [pytest.mark.browser, needs_chromium]
 
 APP = Path(dt_viz.__file__).parent.parent / "app.py"
 STORED = "Object.keys(localStorage).find(key => key.endsWith('dt-viz'))"
-FULL = "() => { Storage.prototype.setItem = () => { throw new DOMException('full', 'QuotaExceededError'); }; }"
-"""Makes a page that has no room left to keep anything."""
 
 
 def kept(page):
@@ -105,20 +103,6 @@ def test_what_is_damaged_is_said_once_and_the_page_begins_anew(visit, server, te
     reload(page, server)
     page.get_by_text(re.compile("· restored$")).wait_for()
     assert page.get_by_text("begins anew").count() == 0
-
-
-def test_a_browser_without_room_says_so_and_the_page_goes_on(visit, server):
-    page, _ = visit
-    wait_until(lambda: (found := kept(page)) is not None and not found.view.arm, "the browser to keep it")
-    before = kept(page)
-    again = reload(page, server)
-    page.evaluate(FULL)
-    add(page, "Box")
-    page.get_by_text(keeping.FULL).first.wait_for()
-    assert again.session.wait_idle(PATIENCE)
-    assert len(again.session.scenario.obstacles) == 2 and kept(page) == before
-    assert page_errors and all("Failed to set localStorage item" in error for error in page_errors)
-    page_errors.clear()
 
 
 def test_a_browser_that_is_not_allowed_to_keep_anything_says_so_and_the_page_goes_on(visit, server):
