@@ -129,6 +129,19 @@ def panel_of(server: viser.ViserServer, notify: Any = ignored) -> ControlPanel:
     return ControlPanel(server.gui, TITLES, load_jaco(), {"": "JACO"}, ignored, notify, camera, ignored)
 
 
+class Kept(dict):
+    """What a browser keeps for this page, told at once."""
+
+    def get_item(self, key: str, timeout: float | None = None) -> Any:
+        return self.get(key)
+
+    def set_item(self, key: str, value: str) -> None:
+        self[key] = value
+
+    def remove_item(self, key: str) -> None:
+        self.pop(key, None)
+
+
 class NoFrames:
     """An engine that has no frames: nothing here is about motions."""
 
@@ -154,7 +167,7 @@ class NoFrames:
 class Page:
     """A visitor's page on a server that nobody looks at, and what a browser may send to it."""
 
-    def __init__(self, server: viser.ViserServer, robot: Any, arms: Any = None) -> None:
+    def __init__(self, server: viser.ViserServer, robot: Any, arms: Any = None, kept: Any = None) -> None:
         self.gui, self.scene = server.gui, server.scene
         self.camera = CameraClient().camera
         self.client = SimpleNamespace(
@@ -162,6 +175,7 @@ class Page:
             gui=server.gui,
             scene=server.scene,
             camera=self.camera,
+            local_storage=Kept() if kept is None else kept,
             atomic=contextlib.nullcontext,
             flush=lambda: None,
             add_notification=lambda *_what, **_how: None,

@@ -26,7 +26,7 @@ MAY_IMPORT: Mapping[str, set[str]] = {
     "obstacles": {"foundation", "kernels", "flows", "files"},
     "robot": {"foundation", "kernels", "flows", "files", "obstacles"},
     "avoidance": {"foundation", "kernels", "flows", "learning", "obstacles", "robot"},
-    "scenario": BELOW_SCENARIO - {"files", "robot"},
+    "scenario": BELOW_SCENARIO - {"robot"},
     "motion": BELOW_SCENARIO | {"scenario"},
     "control": BELOW_SCENARIO | {"kernels", "scenario", "motion"},
     "pictures": BELOW_SCENARIO | {"scenario"},

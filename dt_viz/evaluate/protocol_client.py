@@ -62,6 +62,8 @@ class ProtocolClient:
         """Properties of the scene's nodes, by name; arrays are flat."""
         self.controls: dict[str, dict[str, Any]] = {}
         """Properties of the panel's controls, by identifier."""
+        self.storage: dict[str, str] = {}
+        """What the browser keeps, by name."""
         self.notices: list[str] = []
         """Texts of the notifications."""
         self.num_bytes = self.num_messages = 0
@@ -175,9 +177,12 @@ class ProtocolClient:
                 now = time.perf_counter()
                 for message in decoded(raw):
                     self._apply(message, now)
+                    if message["type"] == "LocalStorageGetItemRequestMessage":
+                        told = {"value": self.storage.get(message["key"]), "request_uuid": message["request_uuid"]}
+                        await self.send("LocalStorageGetItemResponseMessage", error=None, **told)
                 self._news.set()
             self._ended = LostError("the server closed the connection")
-        except websockets.ConnectionClosed as error:
+        except (websockets.ConnectionClosed, LostError) as error:
             self._ended = error
         finally:
             self._news.set()
@@ -187,6 +192,10 @@ class ProtocolClient:
         kind = message["type"]
         if kind == "NotificationShowMessage":
             self.notices.append(message["props"]["body"])
+        elif kind == "LocalStorageSetItemMessage":
+            self.storage[message["key"]] = message["value"]
+        elif kind == "LocalStorageRemoveItemMessage":
+            self.storage.pop(message["key"], None)
         elif kind == "SceneNodeUpdateMessage":
             self.nodes.setdefault(message["name"], {}).update(message["updates"])
             self.changed(message["name"], message["updates"], now)

@@ -37,6 +37,12 @@ MAX_STARTS = 36
 """Largest number of added starts on the page."""
 MAX_MARGIN = 0.05
 """Largest margin, metres."""
+MAX_DISTANCE = 5.0
+"""Largest coordinate of a place on the page, metres."""
+MAX_SIGHT = 1e4
+"""Largest coordinate of a camera and of the point it looks at, metres."""
+MIN_TURN, MAX_TURN = 0.5, 2.0
+"""Smallest and largest norm of a quaternion; browsers send unit ones, with rounding."""
 
 
 @dataclass(frozen=True)

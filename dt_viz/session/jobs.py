@@ -62,6 +62,11 @@ class Jobs:
         with self._changed:
             self._changed.wait_for(lambda: self.superseded(lane), seconds)
 
+    def pause(self, seconds: float) -> None:
+        """Pause the work of a lane, which calls this, for so long, whatever waits, or until the visitor has left."""
+        with self._changed:
+            self._changed.wait_for(lambda: self.closed, seconds)
+
     def wait_idle(self, lane: str | None = None, timeout: float | None = None) -> bool:
         """Wait until a lane, or each, has nothing to do; False if that took longer than `timeout` seconds."""
         with self._changed:

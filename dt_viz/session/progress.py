@@ -56,6 +56,8 @@ class Progress:
     failed: bool = False
     """Whether the last work ended by an error, so that what is wanted may never be shown."""
     message: Message | None = None
+    restored: Scenario | None = None
+    """The scenario that was found in the browser; None if none was."""
 
     @property
     def stale(self) -> bool:
@@ -87,10 +89,10 @@ class Display(Protocol):
 class Screen:
     """A display and what it shows: one thread after the other, so that the newest is shown last."""
 
-    def __init__(self, display: Display, wanted: Scenario) -> None:
+    def __init__(self, display: Display, wanted: Scenario, restored: Scenario | None = None) -> None:
         self._display = display
         self._adopting, self._telling = threading.RLock(), threading.RLock()
-        self.progress = Progress(wanted)
+        self.progress = Progress(wanted, restored=restored)
         self._pace = self.progress.pace
         """Of the newest frame."""
         self._learned = -math.inf

@@ -56,6 +56,7 @@ class Session:
         task: str,
         display: Display,
         new_engine: NewEngine | None = None,
+        restored: Scenario | None = None,
     ) -> None:
         """Start with a task.
 
@@ -65,13 +66,14 @@ class Session:
             task: name of the first one.
             display: where results go.
             new_engine: makes engines for other arms; None if there are none.
+            restored: scenario of the first arm to start with instead, if any; see also `restore`.
         """
         self.engines = Engines(engine, new_engine)
         """Engines of this session, by its arms."""
         self._initial = initial
         self._lock = threading.Lock()
-        self.scenario = initial(engine, task)
-        self._screen = Screen(display, self.scenario)
+        self.scenario = initial(engine, task) if restored is None else restored
+        self._screen = Screen(display, self.scenario, restored)
         self._history = History()
         self._unadopted = False
         """Whether the scenario was edited by a drag and is not shown on the controls yet."""
@@ -175,18 +177,7 @@ class Session:
         """
         if name == self.scenario.arm:
             return
-
-        def tell(fraction: float, message: str) -> None:
-            end_if(partial(self.jobs.superseded, CHOICES))
-            self._screen.tell(learning=(fraction, f"Loading the arm: {message}"))
-
-        before = self.task
-        try:
-            engine = self.engines(name, tell)
-            tell(1.0, "placing the task in its reach")
-            after = engine.task(self.scenario.task)
-        finally:
-            self._screen.tell(learning=None)
+        before, (engine, after) = self.task, self._task_of(name, self.scenario.task)
         there, gone = relocated(self.scenario, before, after, engine.follower.robot.reaches)
         scene = SCENES.get(there.scene)
         if scene is not None and scene.of_jaco and not is_jaco(engine.follower.robot):
@@ -204,6 +195,27 @@ class Session:
             said.append(f"Out of reach of the {arm}, and left out: {', '.join(gone)}.")
         if said:
             self.say(" ".join(said), Severity.NOTE)
+
+    def restore(self, scenario: Scenario) -> None:
+        """Go on with a scenario from before, of any arm; called on the lane `CHOICES`. Raises as `choose_arm`."""
+        self._task_of(scenario.arm, scenario.task)
+        self._begin("restore", scenario, arm=scenario.arm)
+        self._screen.tell(restored=scenario)
+
+    def _task_of(self, arm: str, name: str) -> tuple[Engine, Task]:
+        """The engine for an arm, loaded if need be, and its task of that name; see `choose_arm`."""
+
+        def tell(fraction: float, message: str) -> None:
+            end_if(partial(self.jobs.superseded, CHOICES))
+            self._screen.tell(learning=(fraction, f"Loading the arm: {message}"))
+
+        try:
+            engine = self.engines(arm, tell)
+            if arm != self.scenario.arm:
+                tell(1.0, "placing the task in its reach")
+            return engine, engine.task(name)
+        finally:
+            self._screen.tell(learning=None)
 
     def reset(self) -> None:
         """Back to how the task or the scene began, and was looked at; the motion's part of it can be undone."""
@@ -224,9 +236,9 @@ class Session:
         """
         self._begin("load", self._as_seen(scenario(self.engine.task(task))))
 
-    def _begin(self, gesture: str, fresh: Scenario) -> None:
-        changes = {name: getattr(fresh, name) for name in fresh.__dataclass_fields__ if name not in ("arm", "passing")}
-        self.step(gesture, anew=True, **changes)
+    def _begin(self, gesture: str, fresh: Scenario, **changes: Any) -> None:  # noqa: ANN401 - the fields of Scenario
+        own = {name: getattr(fresh, name) for name in fresh.__dataclass_fields__ if name not in ("arm", "passing")}
+        self.step(gesture, anew=True, **own, **changes)
 
     def _as_seen(self, other: Scenario) -> Scenario:
         """Another scenario, looked at as this one, on the slice that it had.

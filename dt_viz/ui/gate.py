@@ -53,6 +53,8 @@ FOREIGN: Refusal = (
 )
 FULL: Refusal = HTTPStatus.SERVICE_UNAVAILABLE, "All places are taken, and those to wait, too."
 CROWDED: Refusal = HTTPStatus.TOO_MANY_REQUESTS, "Too many pages are open from your address. Close one of them."
+STORED = "LocalStorageGetItemResponseMessage"
+"""Message with what a browser has kept."""
 KINDS: Mapping[str, str] = {
     "ViewerCameraMessage": "message",
     "GuiUpdateMessage": "message",
@@ -64,6 +66,7 @@ KINDS: Mapping[str, str] = {
     "SceneNodeDragMessage": "message",
     "ScenePointerMessage": "message",
     "GetRenderResponseMessage": "image",
+    STORED: "message",
     "FileTransferStartUpload": "message",
     "FileTransferPart": "part",
 }
@@ -360,7 +363,10 @@ class Gate:
             name = msgspec.msgpack.decode(raw, type=_Kind).type
             if name not in KINDS:
                 return False
-            if len(raw) > getattr(self.limits, KINDS[name]):
+            too_large = len(raw) > getattr(self.limits, KINDS[name])
+            if too_large and name == STORED:
+                return False  # the page may have been told to keep it by whoever shares its origin
+            if too_large:
                 raise MalformedError(f"{len(raw)} bytes")
             message: Any = self._decoders[name].decode(raw)
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:

@@ -13,13 +13,8 @@ import numpy as np
 import viser
 
 from dt_viz.flows.fields import Array
+from dt_viz.scenario.scenario import MAX_DISTANCE, MAX_SIGHT, MAX_TURN, MIN_TURN
 
-MAX_DISTANCE = 5.0
-"""Largest coordinate of a place, metres."""
-MAX_SIGHT = 1e4
-"""Largest coordinate of a camera and of the point it looks at, metres."""
-MIN_TURN, MAX_TURN = 0.5, 2.0
-"""Smallest and largest norm of a quaternion; browsers send unit ones, with rounding."""
 PHASES = ("start", "update", "end")
 
 

@@ -56,9 +56,10 @@ class ControlPanel:
         tripod: CameraController,
         darken: Callable[[bool], None],
         preview: Show = lambda _seen, _number: None,
+        forget: Callable[[], None] = lambda: None,
     ) -> None:
         """Build the controls, for the titles of tasks and arms by name; they act once `connect` has given a session."""
-        self._notify, self._tripod, self._titles = notify, tripod, dict(titles)
+        self._notify, self._begin_anew, self._titles = notify, (tripod.view, forget), dict(titles)
         self._notified: Message | None = None
         self._scenes = {scene.title: scene for scene in offered(self._titles)}
         self.bindings = bindings = Bindings()
@@ -215,7 +216,8 @@ class ControlPanel:
     def _travel(self, session: Session, button: str) -> None:
         {"Undo": session.undo, "Redo": session.redo, "Reset": session.reset}[button]()
         if button == "Reset":
-            self._tripod.view()
+            for begin in self._begin_anew:
+                begin()
 
 
 def add_avoid_and_imitate(gui: viser.GuiApi, bindings: Bindings) -> None:

@@ -19,6 +19,7 @@ from dt_viz.serving.board import Share, own_share
 from dt_viz.serving.listening import listen
 from dt_viz.session.arms import ArmStore
 from dt_viz.ui.gate import Gate, Limits
+from dt_viz.ui.keeping import KEY
 from dt_viz.ui.origins import Origin, Origins
 from dt_viz.ui.panel import MAX_UPLOAD
 from dt_viz.ui.tabs.status import COLOURS
@@ -195,6 +196,7 @@ class Server:
         except Exception as error:
             logger.exception("the page of visitor %d could not be built", client.client_id)
             client.gui.add_markdown(f"**The page could not be built.** {type(error).__name__}: {error}")
+            client.local_storage.remove_item(KEY)  # it may be what it began with: it begins anew after a reload
             self._farewell(client)
             return
         with self._lock:

@@ -9,19 +9,23 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 import viser
 
 from dt_viz.files.uploads import keep_ready, let_go
-from dt_viz.obstacles.shapes import Sphere
+from dt_viz.obstacles.shapes import Sphere, TriangleObstacle, as_point
 from dt_viz.robot.robot import Robot
+from dt_viz.scenario.saved import Known, Saved
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import with_avoidance
 from dt_viz.session.arms import ArmStore
+from dt_viz.session.comparison import OTHERS
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.opening import Preview
 from dt_viz.session.progress import Display, Pace, Progress
 from dt_viz.session.session import Session
+from dt_viz.ui.keeping import Keeper
 from dt_viz.ui.panel import ControlPanel
 from dt_viz.ui.playback import Playback
 from dt_viz.ui.scene.camera import CameraController
@@ -37,6 +41,11 @@ def initial_scenario(engine: Engine, name: str) -> Scenario:
     scenario, task = Scenario(name), engine.task(name)
     sphere = Sphere(task.obstacle_position, task.size * Sphere.diameter)
     return replace(scenario, stack=with_avoidance(scenario, obstacles=(sphere,)))
+
+
+def _takes_long(scenario: Scenario) -> bool:
+    """Whether another arm, or surfaces of obstacles, are to be made for a scenario before it is shown."""
+    return bool(scenario.arm) or any(isinstance(obstacle, TriangleObstacle) for obstacle in scenario.obstacles)
 
 
 def notify(client: viser.ClientHandle, text: str, colour: Colour) -> None:
@@ -69,7 +78,9 @@ class Visitor(Display):
             self.robot = RobotScene(client, robot, Playback(engine.arm, self._pose))
         self._exchanging = threading.RLock()  # the arm is moved, and shown or hidden, by other threads
         titled = {"": robot.title} if arms is None else arms.titles
-        self._camera = CameraController(client, lambda: self.robot.hand, robot.size)
+        methods = tuple(method.name for method in OTHERS)
+        self._keeper = Keeper(client.local_storage, Known(titles, titled, methods), self._made)
+        self._camera = CameraController(client, lambda: self.robot.hand, robot.size, self._keeper.changed)
         self._panel = ControlPanel(
             client.gui,
             titles,
@@ -80,9 +91,15 @@ class Visitor(Display):
             self._camera,
             self._darken,
             self._preview,
+            self._keeper.forget,
         )
-        self.session = Session(engine, initial_scenario, task, self, arms and arms.engine)
+        begun = self._keeper.begun
+        at_once = None if begun is None or _takes_long(begun.scenario) else begun.scenario
+        self.session = Session(engine, initial_scenario, task, self, arms and arms.engine, at_once)
         self._panel.connect(self.session)
+        self._keeper.begin(self.session, self._resume)
+        if begun is not None and at_once is None:
+            self._resume(begun)
         self.ruler = Ruler()
         """What the visitor's window is measured with."""
         self.robot.playback.begin(self.session.jobs, self.session.fail)
@@ -103,6 +120,8 @@ class Visitor(Display):
         others = frame.stage is not Stage.ROLLOUTS and len(beside) != len(self._camera.panels)
         if self.shown is None or frame.task is not self.shown.task or others:
             self._camera.look(frame.task, beside)
+        if (sight := self._keeper.sight(frame)) is not None:
+            self._camera.choose((np.array(sight[0]), np.array(sight[1])))
         with self.client.atomic():
             self.pictures.draw(frame)
             self.robot.draw(frame, self.pictures.look)
@@ -116,6 +135,7 @@ class Visitor(Display):
             self.pictures.adopt(scenario)
             self.robot.adopt(scenario.view, self.pictures.look)
         self._panel.adopt(scenario)
+        self._keeper.changed()
 
     def tell(self, progress: Progress) -> None:
         self._panel.tell(progress)
@@ -126,6 +146,15 @@ class Visitor(Display):
         """Stop all work: the visitor has left."""
         let_go(self)
         self.session.close()
+
+    def _made(self) -> Saved:
+        """What the visitor has made."""
+        pose = self._camera.chosen
+        return Saved(self.session.scenario, None if pose is None else (as_point(pose[0]), as_point(pose[1])))
+
+    def _resume(self, saved: Saved) -> None:
+        """Go on with what was kept, beside the server's event loop."""
+        self._panel.begin(lambda session, _title: session.restore(saved.scenario), self.session, "")
 
     def _preview(self, seen: Preview | None, number: int | None) -> None:
         """Show takes that are not learned yet in place of the motion; see `ui.tabs.opening.Show`."""

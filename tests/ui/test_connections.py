@@ -28,6 +28,7 @@ from dt_viz.serving.listening import listen
 from dt_viz.session.progress import Pace
 from dt_viz.ui import gate
 from dt_viz.ui import server as server_module
+from dt_viz.ui.keeping import KEY
 from dt_viz.ui.origins import Origin
 from dt_viz.ui.panel import MAX_UPLOAD
 from dt_viz.ui.patches import GateError
@@ -332,6 +333,8 @@ MALFORMED = {
     "value that no control has": packed("GuiUpdateMessage", uuid="secret", updates={"value": {"a": [1]}}),
     "nested deep": b"\x82\xa4type\xb0GuiUpdateMessage\xa7updates" + b"\x91" * 50_000,
     "large": packed("SceneNodeClickMessage", name="secret" * 20_000),
+    "kept of another type": packed(gate.STORED, value=["secret"], error=None, request_uuid=""),
+    "kept without an answer": packed(gate.STORED, value="secret"),
 }
 
 
@@ -345,6 +348,50 @@ async def test_a_message_that_no_page_sends_ends_its_connection(url, raw, caplog
     printed = "".join(capfd.readouterr())
     assert "Traceback" not in caplog.text + printed
     assert "secret" not in caplog.text + printed
+
+
+@asynchronous
+async def test_what_a_browser_keeps_is_found_again_by_the_next_page(url, server):
+    async with visiting(url) as client:
+        await client.set("Warp", 0.5)
+        await come_true(lambda: KEY in client.storage)
+        (visitor,) = server.visitors
+        made, kept = visitor.session.scenario, client.storage
+    await come_true(lambda: not server.visitors)
+    async with Client(url) as client:
+        client.storage = kept
+        await client.look()
+        assert await client.wait_for(lambda: client.has_picture, PATIENCE)
+        (visitor,) = server.visitors
+        assert visitor.session.scenario == made and made.warp == 0.5
+
+
+@pytest.mark.parametrize("text", ["{", "x" * 10**6], ids=["damaged", "too large for a message"])
+@asynchronous
+async def test_whatever_a_browser_keeps_the_page_opens_in_time_says_so_and_goes_on(url, server, text):
+    async with Client(url) as client:
+        client.storage = {KEY: text}
+        await client.look()
+        began = monotonic()
+        await come_true(lambda: server.visitors)
+        assert monotonic() - began < 5
+        assert await client.wait_for(lambda: client.has_picture and client.notices, PATIENCE)
+        assert "begins anew" in " ".join(client.notices)
+        await client.set("Warp", 0.5)
+        await come_true(lambda: '"warp":0.5' in client.storage.get(KEY, ""))
+        assert await answers(client)
+
+
+@asynchronous
+async def test_what_nobody_has_asked_a_browser_for_changes_nothing(url, server):
+    async with visiting(url) as client:
+        (visitor,) = server.visitors
+        before = visitor.session.scenario
+        for size in (10, 10**6):
+            for error in (None, "forbidden"):
+                await client.send(gate.STORED, value="x" * size, error=error, request_uuid="forged")
+        assert await answers(client)
+        assert visitor.session.scenario.choices == before.choices
 
 
 @asynchronous

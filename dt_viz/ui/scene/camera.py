@@ -14,6 +14,7 @@ import viser
 
 from dt_viz.flows.fields import Array
 from dt_viz.scenario.panels import TITLE_ROOM, directions
+from dt_viz.scenario.scenario import MAX_SIGHT
 from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.tasks import Task
 from dt_viz.ui import gestures
@@ -185,17 +186,24 @@ class CameraController:
     Where the visitor moves the camera, the orbit waits, and goes on from there; while it is locked, it is put back.
     """
 
-    def __init__(self, client: viser.ClientHandle, hand: Callable[[], Array | None], arm_size: float = 1.0) -> None:
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        hand: Callable[[], Array | None],
+        arm_size: float = 1.0,
+        moved: Callable[[], None] = lambda: None,
+    ) -> None:
         """Take over the camera of a visitor, and leave it where it is until `look`.
 
         Args:
             client: connection of the visitor.
             hand: says where the hand is, (3,), metres, if it is anywhere.
             arm_size: reach of the arm, relative to the JACO's.
+            moved: called when the visitor has moved it, or chosen a view. It must only submit.
         """
         self.locked = self.orbits = False
         """Whether the camera is put back where a visitor moves it, and turns slowly around what it shows."""
-        self._client, self._hand = client, hand
+        self._client, self._hand, self._moved = client, hand, moved
         self._lock = threading.RLock()  # tasks, ticks and reports come from threads of their own
         self._given: deque[Pose] = deque(maxlen=64)
         """Poses that the camera was given since it took another view, the newest last: a browser reports late."""
@@ -217,6 +225,21 @@ class CameraController:
         return () if self._shown is None else self._shown[1]
 
     @property
+    def chosen(self) -> Pose | None:
+        """Pose of the camera; None while it shows all as it began, or nothing yet."""
+        with self._lock:
+            if self._shown is None:
+                return None
+            pose, home = self._chosen or self._given[-1], view_of(self._shown[0], self._framing, HOME, self.panels)
+            return None if np.abs(np.subtract(pose, home)).max() <= MOVED else pose
+
+    def choose(self, pose: Pose) -> None:
+        """Move the camera to where a visitor has chosen."""
+        with self._lock, self._client.atomic():
+            self._chosen = pose
+            self._client.camera.position, self._client.camera.look_at = pose
+
+    @property
     def framing(self) -> Framing:
         """The framing in the window as it is now."""
         return replace(self._framing, size=window_size(self._client.camera, self._width))
@@ -235,6 +258,7 @@ class CameraController:
                 self._shown = (*self._shown[:2], name)
                 self._given.clear()
                 self._frame()
+        self._moved()
 
     def reframe(self, **changes: Any) -> None:  # noqa: ANN401 - the fields of Framing
         """Frame the view with other values of `Framing`."""
@@ -280,14 +304,13 @@ class CameraController:
 
     async def _reported(self, camera: viser.CameraHandle) -> None:
         """Take note of where the camera is: put it back, leave it, or fit the picture to a window of another size."""
-        position, look_at = (
-            gestures.vector(place, 3, gestures.MAX_SIGHT) for place in (camera.position, camera.look_at)
-        )
+        position, look_at = (gestures.vector(place, 3, MAX_SIGHT) for place in (camera.position, camera.look_at))
         if position is None or look_at is None or self._shown is None:
             return
         with self._lock:
             reported = np.stack([position, look_at])
-            moved = all(np.abs(reported - given).max() > MOVED for given in self._given)
+            known = [*self._given, *([] if self._chosen is None else [self._chosen])]
+            moved = all(np.abs(reported - pose).max() > MOVED for pose in known)
             if moved and self.locked:
                 self._put(self._chosen or self._given[-1])
             elif moved:
@@ -297,3 +320,5 @@ class CameraController:
             elif self._chosen is not None and np.abs(reported - self._given[-1]).max() <= MOVED:
                 self._chosen = None
             self._fit()
+        if moved:
+            self._moved()

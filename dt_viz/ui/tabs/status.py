@@ -98,7 +98,10 @@ def verdict(progress: Progress) -> Verdict:
     figures = () if frame.blocked else (_clearance_text(frame, view),)
     if known.lyapunov_falls is not None:
         figures += ("stable" if known.lyapunov_falls else "not stable",)
-    figures += (f"{1e3 * latency:.0f} ms" if latency < 1 else f"{latency:.1f} s",)
+    if progress.wanted == progress.restored:
+        figures += ("restored",)
+    else:
+        figures += (f"{1e3 * latency:.0f} ms" if latency < 1 else f"{latency:.1f} s",)
     head, severity, reason = _judged(frame, concerns(frame, view))
     if not progress.complete:
         # a warning that is known stays in view; whether all checks hold is not known

@@ -1,0 +1,285 @@
+"""Saved scenarios: what a visitor has made, as a text of some kB that is checked like a file from a stranger.
+
+The text is JSON, one object:
+
+`version`
+    `FORMAT`.
+`scenario`
+    The `Scenario` by its fields, without its `passing`, which a session decides anew. What is shown
+    is its field `view`.
+`camera`
+    Position and look-at of the camera, metres; null is the view that the task begins with.
+
+Objects are written by their fields, with the name of their class; fields that are left out have their defaults. Shapes
+of the paper's figures are written by their names (`Figure`). Shapes from files are too large and a visitor's own
+demonstrations are tasks of his alone: `portable` leaves out the former, and `decode` refuses the latter.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from dt_viz.avoidance.avoidance import Avoidance
+from dt_viz.avoidance.page import Choice, FlowIntegration, Number
+from dt_viz.avoidance.registry import KINDS, entry_of
+from dt_viz.avoidance.transform import Anchored, Transform
+from dt_viz.errors import DataError, FormatError, check_between, parsing
+from dt_viz.files.checks import check_at_most
+from dt_viz.files.values import packed, unpacked
+from dt_viz.flows.diffeomorphisms import MAX_STEPS
+from dt_viz.obstacles.clouds import Cloud
+from dt_viz.obstacles.shapes import (
+    UPRIGHT,
+    Box,
+    CloudObstacle,
+    Cylinder,
+    MeshObstacle,
+    Obstacle,
+    Point,
+    Quaternion,
+    Sphere,
+    TriangleObstacle,
+)
+from dt_viz.obstacles.solids import Solid
+from dt_viz.scenario.paper_scenes import CLOVER, bottle, offered
+from dt_viz.scenario.scenario import (
+    MAX_DISTANCE,
+    MAX_MARGIN,
+    MAX_OBSTACLES,
+    MAX_SIGHT,
+    MAX_STARTS,
+    MAX_TURN,
+    MIN_TURN,
+    OFFERS,
+    Layer,
+    Scenario,
+)
+from dt_viz.scenario.tasks import STYLES
+
+FORMAT = 1
+"""Version of the text; raised where texts from before cannot be read any more. A new field that has a default does not
+need that."""
+MAX_BYTES = 64 * 1000
+"""Largest number of bytes of a text."""
+SIZES = (0.002, 2.0)
+"""Smallest depth and largest radius of an obstacle, metres: beyond the page's sliders, as scenes scale with the arm."""
+ROOM = 5.0
+"""Factor by which other lengths may be beyond the page's sliders, for the same reason."""
+SCALES = (0.02, 20.0)
+"""Smallest and largest scale of a shape of a figure."""
+STYLE_AMOUNTS = (-1.0, 2.0)
+"""Smallest and largest part of a style that is put on."""
+MAX_FLOWS = MAX_PANELS = 20
+"""Largest number of a flow of the imitation, and of panels: more than any task or stack has."""
+MAX_ROLLOUT = 10**4
+"""Largest number of the rollout that the arm follows; it is counted round."""
+SHIPPED: Mapping[str, Callable[[], Solid | Cloud]] = {"bottle": bottle, "clover": lambda: CLOVER.cloud}
+"""Shapes of the paper's figures, by their names."""
+
+Sight = tuple[Point, Point]
+"""Position and look-at of a camera, metres."""
+
+
+class ScenarioError(DataError):
+    """A scenario that cannot be saved, or a text that is no saved scenario."""
+
+
+@dataclass(frozen=True)
+class Saved:
+    """What is saved of a visitor's page."""
+
+    scenario: Scenario
+    camera: Sight | None = None
+    """None where the camera shows what the task begins with."""
+
+
+@dataclass(frozen=True)
+class Known:
+    """Names that a scenario may have."""
+
+    tasks: Collection[str]
+    arms: Collection[str] = ("",)
+    methods: Collection[str] = ()
+    """Names of methods that ours is compared with."""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """Stand-in for an obstacle whose shape is one of `SHIPPED`."""
+
+    position: Point
+    shape: str
+    wxyz: Quaternion = UPRIGHT
+    scale: float = 1.0
+
+    @property
+    def obstacle(self) -> Obstacle:
+        """The obstacle. Raises FormatError where there is no such shape."""
+        _check_named("shape", self.shape, SHIPPED)
+        shape = SHIPPED[self.shape]()
+        make = MeshObstacle if isinstance(shape, Solid) else CloudObstacle
+        made: Any = make(self.position, shape, self.wxyz, self.scale)  # pyright: ignore[reportArgumentType]
+        return made
+
+
+SMALL = (Sphere, Box, Cylinder)
+"""Obstacles that are written by their numbers."""
+
+
+def portable(scenario: Scenario) -> tuple[Scenario, int]:
+    """Return a scenario without obstacles whose shapes come from files, and how many these were."""
+    left = _with_obstacles(scenario, lambda obstacle: obstacle if _small(obstacle) is not None else None)
+    return left, len(scenario.obstacles) - len(left.obstacles)
+
+
+def encode(saved: Saved) -> str:
+    """Return what is saved as text, which `decode` reads back to the last bit; the scenario must be `portable`."""
+    scenario = replace(_with_obstacles(saved.scenario, _small), passing=None)
+    plain = {"version": FORMAT, **packed(replace(saved, scenario=scenario), "saved", {})}
+    del plain["scenario"]["passing"]
+    return msgspec.json.encode(plain, enc_hook=lambda number: number.item()).decode()  # numpy's
+
+
+def decode(text: str, known: Known, source: str = "scenario") -> Saved:
+    """Read what `encode` wrote; `source` names the text in messages.
+
+    Raises:
+        ScenarioError: it is too large, is no such text, or has a value that no page of these tasks, arms and methods
+            gives, which is named. Nothing else is raised, whatever the text holds.
+    """
+    with parsing(ScenarioError, source, "text", "a scenario that DT-Viz saved"):
+        content = text.encode()
+        check_at_most("text", len(content), MAX_BYTES, "bytes")
+        plain = msgspec.json.decode(content)
+        version = plain.pop("version", None) if isinstance(plain, dict) else None
+        if version != FORMAT:
+            raise FormatError("version", repr(version)[:40], f"{FORMAT}; another version of DT-Viz may have saved it")
+        saved: Saved = unpacked(plain, Saved, "saved", {}, {Transform: KINDS, Obstacle: (*SMALL, Figure)})
+        saved = replace(saved, scenario=_with_obstacles(saved.scenario, _whole))
+        _check(saved, known)
+        return saved
+
+
+def _with_obstacles(scenario: Scenario, change: Callable[[Any], Any]) -> Scenario:
+    """The scenario with each obstacle changed, or left out where it becomes None."""
+
+    def changed(layer: Layer) -> Layer:
+        if not isinstance(layer.transform, Avoidance):
+            return layer
+        obstacles = tuple(part for part in map(change, layer.transform.obstacles) if part is not None)
+        return replace(layer, transform=replace(layer.transform, obstacles=obstacles))
+
+    return replace(scenario, stack=tuple(map(changed, scenario.stack)))
+
+
+def _small(obstacle: Obstacle) -> Any:  # noqa: ANN401 - an obstacle, or its stand-in
+    """The obstacle by its numbers, or by the name of its shape; None if that is from a file."""
+    if not isinstance(obstacle, MeshObstacle | CloudObstacle):
+        return obstacle
+    shape = obstacle.mesh if isinstance(obstacle, MeshObstacle) else obstacle.cloud
+    name = next((name for name, shipped in SHIPPED.items() if shape == shipped()), None)
+    return name and Figure(obstacle.position, name, obstacle.wxyz, obstacle.scale)
+
+
+def _whole(obstacle: Any) -> Obstacle:  # noqa: ANN401
+    return obstacle.obstacle if isinstance(obstacle, Figure) else obstacle
+
+
+def _check(saved: Saved, known: Known) -> None:
+    """Raise FormatError unless a page could have made it; types, and what its values check themselves, are right."""
+    scenario, view = saved.scenario, saved.scenario.view
+    if scenario.passing is not None:
+        raise FormatError("passing", "one", "none: it is decided anew")
+    scenes = [scene.name for scene in offered(known.tasks) if scene.task == scenario.task]
+    _check_named("task", scenario.task, known.tasks)
+    _check_named("arm", scenario.arm, known.arms)
+    _check_named("scene", scenario.scene, ("", *scenes))
+    _check_named("style", scenario.style, ("", *STYLES))
+    for name in (*view.compared, view.their_arm):
+        _check_named("compared method", name, ("", *known.methods))
+    for panel in view.panels:
+        _check_named("task of a panel", panel.task, ("", *known.tasks))
+    counts = {
+        "obstacles": (len(scenario.obstacles), MAX_OBSTACLES),
+        "starts": (len(scenario.starts), MAX_STARTS),
+        "panels": (len(view.panels), MAX_PANELS),
+        "arm_rollout": (scenario.arm_rollout, MAX_ROLLOUT),
+        "selected": (view.selected, MAX_OBSTACLES),
+        "generator_layer": (view.generator_layer, MAX_FLOWS),
+    }
+    for name, (count, most) in counts.items():
+        check_between(name, count, 0, most)
+    check_between("warp", scenario.warp, 0.0, 1.0)
+    check_between("style_amount", scenario.style_amount, *STYLE_AMOUNTS)
+    for name, value in (("phase", view.phase), ("speed", view.speed)):
+        check_between(name, value, *OFFERS[name].limits[:2])
+    for name, place in _places(saved):
+        check_between(name, np.abs(place).max(), 0.0, MAX_SIGHT if name == "camera" else MAX_DISTANCE)
+    for name, wxyz in _turns(scenario):
+        check_between(name, float(np.linalg.norm(wxyz)), MIN_TURN, MAX_TURN)
+    if saved.camera is not None:
+        check_between("length of sight", float(np.linalg.norm(np.subtract(*saved.camera))), 1e-3, 4 * MAX_SIGHT)
+    for obstacle in scenario.obstacles:
+        if isinstance(obstacle, TriangleObstacle):  # its size would take a while to find
+            check_between("scale of an obstacle", obstacle.scale, *SCALES)
+        else:
+            check_between("depth of an obstacle", obstacle.depth, *SIZES)
+            check_between("radius of an obstacle", obstacle.radius, *SIZES)
+    for layer in scenario.stack:
+        _check_layer(layer, scenario)
+
+
+def _places(saved: Saved) -> Iterator[tuple[str, Point]]:
+    """Yield all places, metres, and what each is of."""
+    scenario, pose = saved.scenario, saved.scenario.view.slice
+    yield from (("place of a start", start.place) for start in scenario.starts)
+    yield from (("position of an obstacle", obstacle.position) for obstacle in scenario.obstacles)
+    transforms = [layer.transform for layer in scenario.stack]
+    yield from ((f"position of {each!r}"[:40], each.position) for each in transforms if isinstance(each, Anchored))
+    yield from () if pose is None else (("position of the slice", pose.position),)
+    yield from (("camera", place) for place in saved.camera or ())
+
+
+def _turns(scenario: Scenario) -> Iterator[tuple[str, Quaternion]]:
+    """Yield all quaternions, and what each is of."""
+    yield from (("wxyz of an obstacle", obstacle.wxyz) for obstacle in scenario.obstacles)
+    if scenario.view.slice is not None:
+        yield "wxyz of the slice", scenario.view.slice.wxyz
+
+
+def _check_layer(layer: Layer, scenario: Scenario) -> None:
+    """Raise FormatError unless the page could have given a layer its name, and its transform its settings."""
+    transform, entry = layer.transform, entry_of(layer.transform)
+    alike = [other for other in scenario.stack if entry_of(other.transform) is entry]
+    check_at_most(f"transforms {entry.title!r}", len(alike), entry.most)
+    pattern = re.escape(entry.title) + ("" if entry.most == 1 else r" [1-9]\d?")
+    same = [other for other in scenario.stack if other.name == layer.name]
+    if len(same) > 1 or not re.fullmatch(pattern, layer.name, re.ASCII):
+        raise FormatError("name of a transform", repr(layer.name)[:40], f"{entry.title!r}, each numbered if several")
+    for setting in entry.settings:
+        value: Any = getattr(transform, setting.field)
+        if isinstance(setting, FlowIntegration):
+            check_between(f"{setting.field}.steps", value.steps, 1, MAX_STEPS)
+        elif isinstance(setting, Choice):
+            _check_named(setting.field, value, setting.options)
+        elif isinstance(setting, Number) and not (setting.automatic and value is None):
+            room = ROOM if setting.scale != 1 else 1.0
+            check_between(setting.field, setting.scale * value, setting.low / room, setting.high * room)
+    plane = getattr(transform, "plane", None)
+    if plane is not None:
+        check_between("plane", float(np.abs(np.array(plane) @ np.transpose(plane) - np.eye(2)).max()), 0.0, 1e-6)
+    if isinstance(transform, Avoidance):
+        check_between("margin", transform.margin, 0.0, MAX_MARGIN)
+        if transform.detour != type(transform)().detour:
+            raise FormatError("detour", "other settings", "those that it has")
+
+
+def _check_named(field: str, name: Any, accepted: Collection[Any]) -> None:  # noqa: ANN401 - of a choice
+    if name not in accepted:
+        raise FormatError(field, repr(name)[:40], ", ".join(map(repr, accepted))[:200])

@@ -1,0 +1,165 @@
+"""What a visitor has made, kept in his browser: read when he connects, written with each edit.
+
+The browser may keep nothing, too much or something else, tell it late or never, and write for two tabs: the page opens
+in time all the same, and says once what is wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+from typing import Protocol
+
+from dt_viz.errors import DataError
+from dt_viz.scenario.saved import Known, Saved, Sight, decode, encode, portable
+from dt_viz.session.frame import Frame, Stage
+from dt_viz.session.session import Session
+from dt_viz.warning import Severity
+
+KEY = "dt-viz"
+"""Name of what is kept, among all that the browser keeps for pages of this address."""
+PATIENCE = 1.0
+"""Time in which a browser must tell what it keeps, seconds."""
+ATTEMPTS = 30
+"""Number of times that it is asked again after the page has opened, while nothing is edited."""
+PAUSE = 0.5
+"""Shortest time between two writes, seconds."""
+LANE = "keeping"
+"""Lane of the session's jobs on which the browser is asked and told."""
+SLOW = "This browser has not told yet what it keeps: the page begins anew, or goes on with it when it comes."
+BLOCKED = "This browser keeps nothing: after a reload, the page begins anew."
+FULL = "This browser has no room left to keep what you do: after a reload, the page begins as before."
+OWN_TASK = "Your own demonstrations are not kept in this browser: after a reload, open them again."
+OWN_SHAPES = "Obstacles from files are not kept in this browser: after a reload, add them again."
+
+
+class Storage(Protocol):
+    """What a browser keeps, as viser has it."""
+
+    def get_item(self, key: str, timeout: float | None = None) -> str | None:
+        """Return a text; None if there is none. Raises TimeoutError, or RuntimeError if it is blocked or gone."""
+
+    def set_item(self, key: str, value: str) -> None:
+        """Keep a text; nobody is told where that fails."""
+
+    def remove_item(self, key: str) -> None:
+        """Keep it no longer."""
+
+
+class Keeper:
+    """Keeps the scenario and the camera of one visitor in his browser: the newest, at most twice a second."""
+
+    def __init__(self, storage: Storage, known: Known, present: Callable[[], Saved]) -> None:
+        """Ask the browser what it keeps, for `PATIENCE` at most.
+
+        Args:
+            storage: what the browser keeps.
+            known: names of what there is on this page.
+            present: says what is there now; asked once there is a session.
+        """
+        self._storage, self._known, self._present = storage, known, present
+        self._session: Session | None = None
+        self._said: list[str] = []
+        """What the visitor has been told, or will be once there is a session."""
+        self._found: str | None = None
+        """Text that the browser had at first."""
+        self._written: str | None = None
+        """Text that was written last, or that needs no writing."""
+        self._proven = False
+        """Whether the browser was asked if it keeps what it is told."""
+        self.begun: Saved | None = None
+        """What the page begins with; None if it begins anew, or has begun."""
+        self._ask()
+
+    def begin(self, session: Session, resume: Callable[[Saved], None]) -> None:
+        """Keep what is there, from now on, when it is `changed`; `resume` takes what the browser tells late."""
+        trouble = tuple(self._said)
+        self._written = self._text()
+        for text in trouble:
+            session.say(text, Severity.WARNING)
+        if BLOCKED not in trouble:
+            self._session = session
+        if SLOW in trouble:
+            session.jobs.submit(LANE, partial(self._ask_again, session, resume))
+
+    def sight(self, frame: Frame) -> Sight | None:
+        """Return where the camera begins with a frame; None where its task says it."""
+        begun = self.begun
+        if begun is None or not frame.scenario.begins_like(begun.scenario):
+            return None
+        if frame.stage is not Stage.ROLLOUTS:  # by now all stands in the scene that the camera may look at
+            self.begun = None
+        return begun.camera
+
+    def changed(self) -> None:
+        """Keep what is there now, soon. Never blocks for long."""
+        if self._session is not None:
+            self._session.jobs.submit(LANE, partial(self._write, self._session), latest=True)
+
+    def forget(self) -> None:
+        """Keep nothing until the next edit."""
+        if self._session is not None:
+            self._session.jobs.submit(LANE, self._remove, latest=True)
+
+    def _ask(self) -> bool:
+        """Ask the browser what it keeps, which then is `begun`; return whether it has answered."""
+        try:
+            self._found = self._storage.get_item(KEY, timeout=PATIENCE)
+            if self._found is not None:
+                self.begun = decode(self._found, self._known, "What this browser keeps")
+        except TimeoutError:
+            self._say(SLOW)
+            return False
+        except RuntimeError:
+            self._say(BLOCKED)
+        except DataError as error:
+            self._storage.remove_item(KEY)
+            self._say(f"The page begins anew. {error}")
+        return True
+
+    def _ask_again(self, session: Session, resume: Callable[[Saved], None]) -> None:
+        told, attempts = False, ATTEMPTS
+        while attempts and not told and not session.jobs.superseded(LANE):
+            told, attempts = self._ask(), attempts - 1
+        if self.begun is not None and session.jobs.superseded(LANE):  # it was edited, or the visitor has left
+            self.begun = None
+        elif self.begun is not None:
+            resume(self.begun)
+
+    def _write(self, session: Session) -> None:
+        text = self._text()
+        if text is None or text == self._written:
+            return
+        self._storage.set_item(KEY, text)
+        self._written = text
+        if not self._proven:
+            with suppress(TimeoutError, RuntimeError):  # it is busy, or gone
+                full = self._storage.get_item(KEY, timeout=PATIENCE) == self._found != text
+                self._proven = True
+                if full:
+                    self._say(FULL)
+        session.jobs.pause(PAUSE)
+
+    def _text(self) -> str | None:
+        """What is to be written; None where it cannot be, which the visitor is told."""
+        present = self._present()
+        if present.scenario.task not in self._known.tasks:
+            self._say(OWN_TASK)
+            return None
+        scenario, num_left = portable(present.scenario)
+        if num_left:
+            self._say(OWN_SHAPES)
+        return encode(replace(present, scenario=scenario))
+
+    def _remove(self) -> None:
+        self._storage.remove_item(KEY)
+        self._written = self._text()
+
+    def _say(self, text: str) -> None:
+        """Tell the visitor, once."""
+        if text not in self._said:
+            self._said.append(text)
+            if self._session is not None:
+                self._session.say(text, Severity.WARNING)

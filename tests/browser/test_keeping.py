@@ -1,0 +1,155 @@
+"""What a visitor has made is in his browser: after a reload, and in another process that serves the same address."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from browsing import (
+    PATIENCE,
+    UNHURRIED,
+    close_notices,
+    open_page,
+    open_tab,
+    page_errors,
+    press,
+    until_drawn,
+    wait_until,
+)
+from chromium import needs_chromium
+
+import dt_viz
+from dt_viz.scenario.saved import Known, decode
+from dt_viz.scenario.tasks import TASKS
+from dt_viz.ui import keeping
+
+pytestmark = [pytest.mark.browser, needs_chromium]
+
+APP = Path(dt_viz.__file__).parent.parent / "app.py"
+STORED = "Object.keys(localStorage).find(key => key.endsWith('dt-viz'))"
+
+
+def kept(page):
+    """What the browser keeps; None if it keeps nothing."""
+    text = page.evaluate(f"localStorage.getItem({STORED})")
+    return None if text is None else decode(text, Known(tuple(TASKS))).scenario
+
+
+@pytest.fixture
+def visit(browser, server):
+    page, visitor = open_page(browser, server, (720, 450))
+    yield page, visitor
+    page.close()
+    wait_until(lambda: not server.visitors, "the visitors to leave")
+
+
+def reload(page, server):
+    """The page anew, and its visitor."""
+    before = set(server.visitors)
+    page.reload()
+    wait_until(lambda: set(server.visitors) - before, "the page of a visitor")
+    (visitor,) = set(server.visitors) - before
+    page.get_by_text("· stable ·").wait_for()
+    assert visitor.session.wait_idle(PATIENCE)
+    return visitor
+
+
+def add(page, shape):
+    press(page.get_by_role("button", name=shape, exact=True))
+
+
+def test_after_a_reload_the_visitor_finds_what_he_has_made(visit, server):
+    page, visitor = visit
+    open_tab(page, "World")
+    add(page, "Cylinder")
+    wait_until(lambda: len(visitor.session.scenario.obstacles) == 2, "the cylinder")
+    visitor._camera.view("Top")
+    wait_until(lambda: kept(page) == visitor.session.scenario, "the browser to keep it")
+    until_drawn(visitor)
+    seen = visitor.client.camera.position, visitor.client.camera.look_at
+    again = reload(page, server)
+    assert again.session.scenario == visitor.session.scenario
+    page.get_by_text(re.compile("· restored$")).wait_for()
+    until_drawn(again)
+    for before, after in zip(seen, (again.client.camera.position, again.client.camera.look_at), strict=True):
+        assert after == pytest.approx(before, abs=2e-3)
+
+    open_tab(page, "World")
+    add(page, "Delete")
+    wait_until(lambda: len(again.session.scenario.obstacles) == 1, "it to be gone")
+    page.get_by_text(re.compile("· restored$")).wait_for(state="detached")
+    press(page.get_by_role("button", name="Reset", exact=True))
+    wait_until(lambda: kept(page) is None, "the browser to forget it")
+    anew = reload(page, server)
+    assert anew.session.scenario.view.arm and page.get_by_text(re.compile("· restored$")).count() == 0
+
+
+@pytest.mark.parametrize("text", ["{", json.dumps({"version": 99}), "x" * 200_000], ids=["damaged", "version", "large"])
+def test_what_is_damaged_is_said_once_and_the_page_begins_anew(visit, server, text):
+    page, _ = visit
+    wait_until(lambda: kept(page) is not None, "the browser to keep something")
+    page.evaluate(f"text => localStorage.setItem({STORED}, text)", text)
+    again = reload(page, server)
+    assert again.session.scenario.view.arm  # not as it was left
+    page.get_by_text("begins anew").first.wait_for()
+    close_notices(page)
+    again.session.edit("test", warp=0.5)
+    wait_until(lambda: (found := kept(page)) is not None and found.warp == 0.5, "the browser to keep the edit")
+    reload(page, server)
+    page.get_by_text(re.compile("· restored$")).wait_for()
+    assert page.get_by_text("begins anew").count() == 0
+
+
+def test_a_browser_that_is_not_allowed_to_keep_anything_says_so_and_the_page_goes_on(visit, server):
+    page, _ = visit
+    page.add_init_script("Object.defineProperty(window, 'localStorage', {get() { throw new Error('forbidden'); }})")
+    again = reload(page, server)
+    page.get_by_text(keeping.BLOCKED).first.wait_for()
+    add(page, "Box")
+    wait_until(lambda: len(again.session.scenario.obstacles) == 2, "the box")
+    assert again.session.wait_idle(PATIENCE)
+    page_errors.clear()
+
+
+# --- another process ---
+
+
+@contextmanager
+def serving(cache, port):
+    """A server in a process of its own; its address and it."""
+    command = [sys.executable, str(APP), "--port", str(port)]
+    environment = os.environ | {"XDG_CACHE_HOME": str(cache), "PYTHONUNBUFFERED": "1"}
+    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            said = iter(process.stdout or ())
+            address = next(found[1] for line in said if (found := re.search(r"DT-Viz is at (http://\S+)", line)))
+            yield address, process
+        finally:
+            process.kill()
+
+
+def test_a_killed_server_loses_nothing(browser, cache, fits):
+    page = browser.new_page(viewport={"width": 720, "height": 450})
+    page.set_default_timeout(1000 * PATIENCE)
+    page.add_init_script(UNHURRIED)
+    with serving(cache, 0) as (address, process):
+        page.goto(address)
+        page.get_by_text("· stable ·").wait_for()
+        close_notices(page)
+        add(page, "Cylinder")
+        wait_until(lambda: (found := kept(page)) is not None and len(found.obstacles) == 2, "the browser to keep it")
+        chosen, made = page.get_by_label("Selected").first.input_value(), kept(page)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    with serving(cache, int(address.rpartition(":")[2])):
+        page.get_by_text(re.compile("· restored$")).wait_for()  # the page connects again by itself
+        assert (page.get_by_label("Selected").first.input_value(), kept(page)) == (chosen, made)
+        page.reload()
+        page.get_by_text(re.compile("· restored$")).wait_for()
+        assert (page.get_by_label("Selected").first.input_value(), kept(page)) == (chosen, made)
+        page.close()

@@ -1,0 +1,362 @@
+"""Saved scenarios: read back exactly; what no page can have saved is refused, by the name of what is wrong."""
+
+import copy
+import json
+import math
+from dataclasses import fields, replace
+from typing import Any
+
+import hostile
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import biases, changed, starts_at
+
+from dt_viz.avoidance.bias import BiasPoint
+from dt_viz.avoidance.passing import ANEW
+from dt_viz.errors import DataError
+from dt_viz.flows.diffeomorphisms import Integration
+from dt_viz.obstacles.clouds import Cloud
+from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, MeshObstacle, Sphere
+from dt_viz.obstacles.solids import Solid
+from dt_viz.obstacles.surfaces import box_surface
+from dt_viz.scenario.panels import Panel
+from dt_viz.scenario.paper_scenes import CLOVER, SCENES, bottle, offered
+from dt_viz.scenario.saved import MAX_BYTES, SHIPPED, Known, Saved, ScenarioError, decode, encode, portable
+from dt_viz.scenario.scenario import SLICE_COLOURS, Scenario, Start, View
+from dt_viz.scenario.slices import SlicePose
+from dt_viz.scenario.stack import with_avoidance
+from dt_viz.scenario.tasks import TASKS
+
+METHODS = ("eflow-repulsive", "linear", "modulation")
+KNOWN = Known(tuple(TASKS), ("", "panda"), METHODS)
+PLACE, TURN = (0.1, -0.5, 0.4), (0.8, 0.0, 0.6, 0.0)
+DRAWING = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+FROM_FILE = Solid(*box_surface(np.full(3, 0.05)))
+
+
+def rich() -> Saved:
+    """Something in each field."""
+    obstacles = (Sphere(PLACE, 0.1), Box(PLACE, (0.1, 0.2, 0.3), TURN), Cylinder(PLACE, 0.08, 0.16, TURN))
+    figures = (MeshObstacle(PLACE, bottle(), TURN, 0.7), CloudObstacle(PLACE, CLOVER.cloud, TURN, 1.2))
+    points = BiasPoint(PLACE, 0.1, 0.5, DRAWING, True, Integration("rk4", 6)), BiasPoint(PLACE)
+    avoidance = {"space": "task", "duration": 0.7, "temperature": 9.5, "margin": 0.03}
+    view = View(
+        slice=SlicePose(PLACE, TURN),
+        colour="det",
+        phase=0.25,
+        compared=("linear", "modulation"),
+        their_arm="linear",
+        selected=3,
+        panels=(Panel(), Panel("Bias 1", generator=True), Panel(task="draw_c", state="plain")),
+        speed=0.5,
+        start_label=0.5,
+    )
+    scenario = changed(
+        Scenario("draw_s", warp=0.3, arm="panda", style="wavy", style_amount=-0.5, arm_rollout=7, state="augmented"),
+        obstacles=(*obstacles, *figures),
+        layers=biases(*points),
+        starts=(Start(PLACE), Start(PLACE, -1.5)),
+        view=view,
+        **avoidance,
+    )
+    scenario = replace(scenario, stack=with_avoidance(scenario, plane=DRAWING))
+    return Saved(scenario, (PLACE, (0.0, 0.0, 1 / 3)))
+
+
+def assert_read_back(saved: Saved) -> None:
+    text = encode(saved)
+    again = decode(text, KNOWN)
+    assert again == saved
+    assert encode(again) == text
+    assert len(text.encode()) <= MAX_BYTES
+
+
+@pytest.mark.parametrize("scene", offered(TASKS), ids=lambda scene: scene.name)
+def test_scenes_of_the_paper_are_read_back_with_their_shapes(scene):
+    assert_read_back(Saved(scene.scenario(TASKS[scene.task]())))
+
+
+def test_everything_is_read_back_exactly():
+    saved = rich()
+    assert_read_back(saved)
+    usual = Scenario("draw_c")
+    same = {
+        field.name for field in fields(Scenario) if getattr(saved.scenario, field.name) == getattr(usual, field.name)
+    }
+    assert same == {"imitation", "objective", "scene", "passing"}
+
+
+def test_numbers_of_numpy_are_numbers():
+    point: Any = tuple(np.array(PLACE))
+    assert_read_back(Saved(changed(Scenario("draw_s"), obstacles=(Sphere(point, np.float64(0.1)),))))
+
+
+def test_how_motions_pass_is_decided_anew():
+    text = encode(Saved(Scenario("draw_s", passing=ANEW)))
+    assert "passing" not in text and decode(text, KNOWN).scenario.passing is None
+
+
+COORDINATES = st.floats(-5, 5)
+PLACES = st.tuples(COORDINATES, COORDINATES, COORDINATES)
+LENGTHS = st.floats(0.03, 0.4)
+TURNS = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda turn: 0.5 < math.hypot(*turn) < 2)
+INTEGRATIONS = st.builds(Integration, st.sampled_from(["auto", "rk4", "euler"]), st.integers(1, 50))
+OBSTACLES = st.one_of(
+    st.builds(Sphere, PLACES, LENGTHS),
+    st.builds(Box, PLACES, st.tuples(LENGTHS, LENGTHS, LENGTHS), TURNS),
+    st.builds(Cylinder, PLACES, LENGTHS, LENGTHS, TURNS),
+    st.builds(MeshObstacle, PLACES, st.just(bottle()), TURNS, st.floats(0.05, 3)),
+)
+POINTS = st.builds(
+    BiasPoint,
+    PLACES,
+    st.none() | st.floats(0.04, 0.4),
+    st.none() | st.floats(0, 4),
+    st.none() | st.just(DRAWING),
+    st.booleans(),
+    INTEGRATIONS,
+)
+SCENARIOS = st.builds(
+    lambda scenario, obstacles, points, avoidance: changed(
+        scenario, obstacles=tuple(obstacles), layers=biases(*points), **avoidance
+    ),
+    st.builds(
+        Scenario,
+        st.sampled_from(sorted(TASKS)),
+        imitation=st.booleans(),
+        warp=st.floats(0, 1),
+        starts=st.lists(st.builds(Start, PLACES, st.none() | st.floats(-2, 2)), max_size=36).map(tuple),
+        arm_rollout=st.integers(0, 40),
+        view=st.builds(
+            View,
+            slice=st.none() | st.builds(SlicePose, PLACES, TURNS),
+            colour=st.sampled_from(sorted(SLICE_COLOURS)),
+            phase=st.floats(0, 1),
+            playing=st.booleans(),
+            speed=st.floats(0.25, 3),
+            compared=st.lists(st.sampled_from(METHODS), unique=True).map(tuple),
+        ),
+    ),
+    st.lists(OBSTACLES, max_size=5),
+    st.lists(POINTS, max_size=4),
+    st.fixed_dictionaries(
+        {
+            "space": st.sampled_from(["task", "cspace"]),
+            "temperature": st.floats(1, 20),
+            "margin": st.floats(0, 0.05),
+            "duration": st.none() | st.floats(0, 2),
+            "integration": INTEGRATIONS,
+        }
+    ),
+)
+
+
+@given(SCENARIOS, st.none() | st.tuples(PLACES, PLACES).filter(lambda sight: math.dist(*sight) > 0.01))
+@settings(max_examples=60)
+def test_whatever_a_page_makes_is_read_back_exactly(scenario, camera):
+    assert_read_back(Saved(scenario, camera))
+
+
+def test_shapes_from_files_are_left_out_and_counted():
+    cloud = Cloud(np.random.default_rng(0).uniform(-0.1, 0.1, (60, 3)))
+    figures = MeshObstacle(PLACE, bottle()), Sphere(PLACE)
+    scenario = changed(
+        Scenario("draw_s"), obstacles=(MeshObstacle(PLACE, FROM_FILE), *figures, CloudObstacle(PLACE, cloud))
+    )
+    left, num = portable(scenario)
+    assert (left.obstacles, num) == (figures, 2)
+    assert_read_back(Saved(left))
+    assert portable(left) == (left, 0)
+
+
+# --- what no page has saved ---
+
+
+def at(path: str, plain: Any, value: Any) -> Any:
+    """A copy of what JSON holds with another value at a place such as "scenario.starts.0.place"."""
+    plain = copy.deepcopy(plain)
+    *way, last = (int(key) if key.isdecimal() else key for key in path.split("."))
+    owner = plain
+    for key in way:
+        owner = owner[key]
+    owner[last] = value
+    return plain
+
+
+AVOIDANCE, BIAS, SPHERE = (
+    "scenario.stack.2.transform",
+    "scenario.stack.0.transform",
+    "scenario.stack.2.transform.obstacles.0",
+)
+FORGERIES: list[tuple[str, Any, str]] = [
+    ("version", 2, "version"),
+    ("version", None, "version"),
+    ("scenario", None, "saved.scenario"),
+    ("extra", 1, "fields of saved"),
+    ("scenario.extra", 1, "fields of saved.scenario"),
+    ("scenario.task", "own_data_1", "task"),
+    ("scenario.task", 3, "saved.scenario.task"),
+    ("scenario.arm", "no arm", "arm"),
+    ("scenario.scene", "no scene", "scene"),
+    ("scenario.scene", "lift", "scene"),
+    ("scenario.style", "baroque", "style"),
+    ("scenario.style_amount", 2.5, "style_amount"),
+    ("scenario.warp", 1.0001, "warp"),
+    ("scenario.warp", -1, "warp"),
+    ("scenario.warp", "1", "warp"),
+    ("scenario.state", "nonsense", "state"),
+    ("scenario.imitation", 1, "imitation"),
+    ("scenario.arm_rollout", -1, "arm_rollout"),
+    ("scenario.arm_rollout", 10**6, "arm_rollout"),
+    ("scenario.arm_rollout", 2**70, "arm_rollout"),
+    ("scenario.passing", {"class": "Passing"}, "passing"),
+    ("scenario.starts", [{"class": "Start", "place": PLACE}] * 37, "starts"),
+    ("scenario.starts.0.place", [0, 0], "place"),
+    ("scenario.starts.0.place", [0, 0, 5.1], "place of a start"),
+    ("scenario.stack", [{"class": "Layer"}], "stack[0]"),
+    ("scenario.stack.0.name", "Bias 2", "name of a transform"),
+    ("scenario.stack.0.name", "Bias ٣", "name of a transform"),
+    ("scenario.stack.0.name", "<script>", "name of a transform"),
+    ("scenario.stack.2.name", "Bias 3", "name of a transform"),
+    ("scenario.stack.1.transform", {"class": "HandAvoidance"}, "transforms 'Avoidance'"),
+    (f"{BIAS}.class", "Sphere", "class"),
+    (f"{BIAS}.position", [0, 0, -5.1], "position"),
+    (f"{BIAS}.radius", 3.0, "radius"),
+    (f"{BIAS}.radius", -0.1, "radius"),
+    (f"{BIAS}.strength", 4.1, "strength"),
+    (f"{BIAS}.plane", [[1, 0, 0], [0.1, 0, 1]], "plane"),
+    (f"{BIAS}.plane", [[1, 0, 0]], "plane"),
+    (f"{BIAS}.integration.steps", 51, "steps"),
+    (f"{BIAS}.integration.method", "leapfrog", "method"),
+    (f"{AVOIDANCE}.temperature", 30.0, "temperature"),
+    (f"{AVOIDANCE}.temperature", None, "temperature"),
+    (f"{AVOIDANCE}.duration", 2.5, "duration"),
+    (f"{AVOIDANCE}.margin", 0.06, "margin"),
+    (f"{AVOIDANCE}.generator", "∇p", "generator"),
+    (f"{AVOIDANCE}.detour.num_directions", 10_000, "detour"),
+    (f"{AVOIDANCE}.obstacles", [{"class": "Sphere", "position": PLACE}] * 6, "obstacles"),
+    (f"{AVOIDANCE}.obstacles.0", {"class": "MeshObstacle", "position": PLACE, "mesh": "a"}, "class"),
+    (f"{AVOIDANCE}.obstacles.1.sizes", [0.1, 0.1, 1e-4], "depth"),
+    (f"{AVOIDANCE}.obstacles.1.sizes", [0.1, 0.1, 5.0], "radius"),
+    (f"{AVOIDANCE}.obstacles.1.wxyz", [0, 0, 0, 0], "wxyz"),
+    (f"{AVOIDANCE}.obstacles.2.height", 0, "height"),
+    (f"{AVOIDANCE}.obstacles.3.shape", "teapot", "shape"),
+    (f"{AVOIDANCE}.obstacles.3.scale", 100.0, "scale"),
+    (f"{SPHERE}.position", [1e3, 0, 0], "position"),
+    (f"{SPHERE}.diameter", 50.0, "depth"),
+    (f"{SPHERE}.diameter", -0.1, "diameter"),
+    ("scenario.view.colour", "red", "colour"),
+    ("scenario.view.phase", 1.1, "phase"),
+    ("scenario.view.speed", 0.0, "speed"),
+    ("scenario.view.selected", -1, "selected"),
+    ("scenario.view.generator_layer", -9, "generator_layer"),
+    ("scenario.view.compared", ["ours", "theirs"], "compared"),
+    ("scenario.view.their_arm", "theirs", "compared"),
+    ("scenario.view.panels", [{"class": "Panel"}] * 21, "panels"),
+    ("scenario.view.panels.0.task", "own_data_1", "panel"),
+    ("scenario.view.slice.position", [0, 9, 0], "slice"),
+    ("scenario.view.slice.wxyz", [0.1, 0, 0, 0], "slice"),
+    ("camera", [PLACE, PLACE], "sight"),
+    ("camera", [PLACE, [2e4, 0, 0]], "camera"),
+    ("camera", [PLACE], "camera"),
+]
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "field"), FORGERIES, ids=[f"{path}={value!r}"[:60] for path, value, _ in FORGERIES]
+)
+def test_what_no_page_can_have_saved_is_refused_by_its_name(path, value, field):
+    forged = at(path, json.loads(encode(rich())), value)
+    with pytest.raises(ScenarioError) as caught:
+        decode(json.dumps(forged), KNOWN, "a browser")
+    assert field in caught.value.field, caught.value
+    assert str(caught.value).startswith("a browser: ")
+
+
+TEXTS = {
+    "empty": "",
+    "no JSON": "hello",
+    "a list": "[]",
+    "null": "null",
+    "not finite": encode(rich()).replace("0.3", "1e999", 1),
+    "not a number": encode(rich()).replace("0.3", "NaN", 1),
+    "deep": "[" * 30_000 + "]" * 30_000,
+    "deep in it": encode(rich()).replace('"camera":', '"camera":' + "[" * 20_000, 1),
+    "half a character": encode(rich()).replace("draw_s", "\ud800", 1),
+    "half a character, escaped": encode(rich()).replace("draw_s", "\\ud800", 1),
+    "too large": encode(rich()) + " " * MAX_BYTES,
+    "too large in bytes": '"' + "ψ" * (MAX_BYTES // 2) + '"',
+}
+
+
+@pytest.mark.parametrize("text", TEXTS.values(), ids=TEXTS)
+def test_texts_that_are_none_are_refused(text):
+    with pytest.raises(ScenarioError):
+        decode(text, KNOWN)
+
+
+def leaves(plain: Any, path: str = "") -> Any:
+    """Paths of all values in what JSON holds."""
+    if isinstance(plain, dict | list):
+        for key, value in plain.items() if isinstance(plain, dict) else enumerate(plain):
+            yield from leaves(value, f"{path}.{key}" if path else str(key))
+    yield path
+
+
+def assert_refused_or_whole(text: str) -> bool:
+    """Whether a text is read, and then is such as a page makes; nothing but a refusal may be raised."""
+    try:
+        saved = decode(text, KNOWN)
+    except DataError as error:
+        assert isinstance(error, ScenarioError) and error.field and error.accepted
+        return False
+    assert_read_back(saved)
+    return True
+
+
+def test_each_value_replaced_by_any_other_is_refused_or_makes_a_scenario():
+    plain = json.loads(encode(rich()))
+    paths = [path for path in leaves(plain) if path]
+    assert len(paths) > 150
+    values = (*hostile.VALUES, -1e-9, 1e6, "draw_c", {"class": "Start"}, PLACE)
+    rng = np.random.default_rng(0)
+    tried = [(path, values[k]) for path in paths for k in rng.choice(len(values), 6, replace=False)]
+    read = [assert_refused_or_whole(json.dumps(at(path, plain, value))) for path, value in tried]
+    assert 0.01 < np.mean(read) < 0.5
+
+
+@pytest.mark.parametrize(
+    "mutation",
+    [
+        hostile.flipped,
+        hostile.overwritten,
+        hostile.truncated,
+        hostile.without_block,
+        hostile.with_block_again,
+        hostile.with_word,
+        hostile.with_line_again,
+    ],
+)
+def test_damaged_texts_are_refused_or_make_a_scenario(mutation):
+    content, rng = encode(rich()).encode(), np.random.default_rng(0)
+    read = [
+        assert_refused_or_whole(mutation(content, rng)[:200_000].decode(errors="surrogateescape")) for _ in range(60)
+    ]
+    assert not all(read)
+
+
+def test_each_shape_of_the_figures_has_a_name():
+    shapes = [
+        obstacle.mesh if isinstance(obstacle, MeshObstacle) else obstacle.cloud
+        for scene in offered(TASKS)
+        for obstacle in SCENES[scene.name].scenario(TASKS[scene.task]()).obstacles
+        if isinstance(obstacle, MeshObstacle | CloudObstacle)
+    ]
+    assert shapes and all(any(shape == shipped() for shipped in SHIPPED.values()) for shape in shapes)
+
+
+def test_starts_are_the_most_that_a_page_has_and_still_small():
+    scenario = replace(rich().scenario, starts=starts_at(*[(1 / 3, -1 / 7, 0.1)] * 36))
+    assert len(encode(Saved(scenario))) < 12_000

@@ -1,0 +1,360 @@
+"""What a visitor has made is kept in his browser: the newest, not too often, and whatever that keeps the page opens."""
+
+import time
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import viser  # noqa: TID251 - a page that no browser shows
+from pages import PATIENCE, TITLES, Kept, Page, frame_of, wait_until
+from scenes import changed, starts_at
+
+from dt_viz.obstacles.shapes import Box, MeshObstacle, Sphere
+from dt_viz.obstacles.solids import Solid
+from dt_viz.obstacles.surfaces import box_surface
+from dt_viz.scenario.paper_scenes import SCENES
+from dt_viz.scenario.saved import Known, Saved, decode, encode
+from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.tasks import TASKS
+from dt_viz.session.frame import Stage
+from dt_viz.session.session import CHOICES
+from dt_viz.ui import keeping
+from dt_viz.ui.keeping import KEY, LANE, PAUSE
+from dt_viz.ui.scene.camera import view_of
+from dt_viz.ui.tabs.status import verdict
+
+PLACE = (0.1, -0.5, 0.4)
+KNOWN = Known(tuple(TITLES))
+MADE = changed(Scenario("draw_c", starts=starts_at(PLACE)), obstacles=(Box(PLACE, (0.1, 0.1, 0.2)),), space="task")
+SIGHT = ((1.0, -1.0, 1.0), (0.0, -0.5, 0.3))
+
+
+class Browser(Kept):
+    """Notes when it is told to keep something, and what."""
+
+    def __init__(self, **kept: str) -> None:
+        super().__init__(kept)
+        self.told: list[tuple[float, str]] = []
+        self.asked = 0
+
+    def get_item(self, key: str, timeout: float | None = None) -> Any:
+        self.asked += 1
+        return super().get_item(key, timeout)
+
+    def set_item(self, key: str, value: str) -> None:
+        self.told.append((time.monotonic(), value))
+        super().set_item(key, value)
+
+
+class Slow(Browser):
+    """Answers only the second time, when it may."""
+
+    answers = False
+
+    def get_item(self, key: str, timeout: float | None = None) -> Any:
+        assert timeout is not None
+        deadline = time.monotonic() + (0.0 if self.asked == 0 else timeout)
+        text = super().get_item(key)
+        while not self.answers:
+            if time.monotonic() >= deadline:
+                raise TimeoutError
+            time.sleep(0.01)
+        return text
+
+
+class Blocked(Browser):
+    def get_item(self, key: str, timeout: float | None = None) -> Any:
+        raise RuntimeError("Failed to read localStorage: forbidden")
+
+
+class Full(Browser):
+    def set_item(self, key: str, value: str) -> None:
+        self.told.append((time.monotonic(), value))
+
+
+@pytest.fixture
+def opened(server, robot):
+    """Opens pages for browsers."""
+    pages = []
+
+    def opens(browser: Any) -> Page:
+        server.gui.reset()
+        server.scene.reset()
+        pages.append(Page(server, robot, kept=browser))
+        return pages[-1]
+
+    yield opens
+    for page in pages:
+        page.close()
+    server.gui.reset()
+    server.scene.reset()
+
+
+@pytest.fixture
+def another():
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    yield server
+    server.stop()
+
+
+def message(page: Page) -> str:
+    said = page.session._screen.progress.message
+    return "" if said is None else said.text
+
+
+def settled(page: Page) -> None:
+    assert page.session.jobs.wait_idle(LANE, PATIENCE)
+
+
+def kept(browser: Browser) -> Saved:
+    return decode(browser[KEY], KNOWN)
+
+
+def made(camera: Any = None, scenario: Scenario = MADE) -> str:
+    return encode(Saved(scenario, camera))
+
+
+def test_each_edit_is_kept_and_the_next_page_begins_with_it(opened):
+    browser = Browser()
+    page = opened(browser)
+    settled(page)
+    assert browser.told == []  # nothing is edited yet
+    page.begin(MADE)
+    settled(page)
+    assert kept(browser) == Saved(MADE)
+    again = opened(Browser(**browser))
+    assert again.session.scenario == MADE and message(again) == ""
+    settled(again)
+    assert again.client.local_storage.told == []
+
+
+def test_the_line_of_status_says_so_until_the_next_edit(opened):
+    page = opened(Browser(**{KEY: made()}))
+    progress = replace(page.session._screen.progress, shown=frame_of(MADE, task=None, rollouts=()))
+    assert progress.restored == progress.wanted == MADE
+    assert "restored" in verdict(progress).line.split(" · ")
+    page.session.edit("test", warp=0.5)
+    wanted = page.session._screen.progress.wanted
+    assert "restored" not in verdict(replace(progress, wanted=wanted)).line
+    assert "restored" not in verdict(replace(progress, restored=None)).line
+
+
+def test_the_newest_is_kept_at_most_twice_a_second(opened):
+    browser = Browser()
+    page = opened(browser)
+    warps, began = np.linspace(0.9, 0.1, 60), time.monotonic()
+    for warp in warps:
+        page.session.edit("Warp", warp=float(warp))
+        time.sleep(0.02)
+    settled(page)
+    times = [when for when, _ in browser.told]
+    assert times[0] - began < PAUSE / 2  # the first edit is not held back
+    assert np.diff(times).min() >= 0.95 * PAUSE
+    assert 2 <= len(times) <= 1 + (times[-1] - began) / PAUSE
+    assert kept(browser).scenario.warp == warps[-1]
+
+
+def test_edits_do_not_wait_for_a_browser_that_does_not(opened):
+    browser = Slow()
+    page = opened(browser)
+    began = time.monotonic()
+    for warp in np.linspace(0.9, 0.1, 20):
+        page.session.edit("Warp", warp=float(warp))
+    assert time.monotonic() - began < PAUSE
+    assert browser.told == []
+    browser.answers = True
+    settled(page)
+    assert kept(browser).scenario.warp == 0.1
+
+
+def test_a_visitor_who_leaves_is_not_waited_for(opened):
+    page = opened(Browser())
+    page.begin(MADE)
+    wait_until(lambda: page.client.local_storage.told)
+    began = time.monotonic()
+    page.visitor.close()
+    assert page.session.jobs.wait_idle(LANE, PAUSE)
+    assert time.monotonic() - began < PAUSE / 2
+
+
+def test_a_reset_begins_anew_also_in_the_next_page(opened):
+    browser = Browser(**{KEY: made()})
+    page = opened(browser)
+    page.claim(page["History"], "Reset")
+    settled(page)
+    assert KEY not in browser and page.session.scenario.obstacles != MADE.obstacles
+    page.session.edit("Warp", warp=0.5)
+    settled(page)
+    assert kept(browser).scenario.warp == 0.5
+    page.claim(page["History"], "Reset")
+    settled(page)
+    assert opened(Browser(**browser)).session.scenario.task == "draw_s"
+
+
+def test_a_reset_is_told_after_what_was_edited_before(opened):
+    browser = Browser()
+    page = opened(browser)
+    for warp in (0.9, 0.8, 0.7):
+        page.session.edit("Warp", warp=warp)
+    page.give(page.commands["Reset the scene and the camera"])
+    settled(page)
+    assert KEY not in browser
+
+
+FORGED = {
+    "damaged": made()[: len(made()) // 2],
+    "forged": made().replace('"warp":1.0', '"warp":7.0'),
+    "another version": made().replace('"version":1', '"version":99'),
+    "too large": made() + " " * 100_000,
+    "of a task that is not here": made().replace("draw_c", "own_data_1"),
+    "something else": '{"theme": "dark"}',
+}
+
+
+@pytest.mark.parametrize("text", FORGED.values(), ids=FORGED)
+def test_what_makes_no_sense_is_forgotten_and_the_page_begins_anew_and_says_so_once(opened, text):
+    browser = Browser(**{KEY: text})
+    page = opened(browser)
+    assert page.session.scenario.task == "draw_s"
+    assert message(page).startswith("The page begins anew. What this browser keeps: ")
+    assert KEY not in browser
+    page.begin(MADE)
+    settled(page)
+    assert kept(browser).scenario == MADE
+    assert message(opened(Browser(**browser))) == ""
+
+
+def test_a_browser_that_keeps_nothing_is_told_once_and_nothing_more_is_asked_of_it(opened):
+    browser = Blocked()
+    page = opened(browser)
+    assert message(page) == keeping.BLOCKED
+    page.begin(MADE)
+    settled(page)
+    assert browser.told == [] and page.session.scenario == MADE
+
+
+def test_a_browser_without_room_is_noticed_and_that_is_said_once(opened):
+    browser = Full(**{KEY: made()})
+    page = opened(browser)
+    said = []
+    page.session.say = lambda text, severity: said.append(text)
+    for warp in (0.5, 0.4):
+        page.session.edit("Warp", warp=warp)
+        settled(page)
+    assert said == [keeping.FULL] and len(browser.told) == 2
+
+
+def test_the_page_opens_before_a_slow_browser_has_told_and_goes_on_with_it_when_it_does(opened):
+    browser = Slow(**{KEY: made()})
+    page = opened(browser)
+    assert page.session.scenario.task == "draw_s" and message(page) == keeping.SLOW
+    browser.answers = True
+    wait_until(lambda: page.session.scenario == MADE)
+    settled(page)
+    assert page.session.jobs.wait_idle(CHOICES, PATIENCE)
+    assert page.session._screen.progress.restored == MADE
+
+
+def test_what_a_slow_browser_tells_after_an_edit_is_not_taken(opened):
+    browser = Slow(**{KEY: made()})
+    page = opened(browser)
+    page.session.edit("Warp", warp=0.5)
+    mine = page.session.scenario
+    browser.answers = True
+    settled(page)
+    assert page.session.jobs.wait_idle(CHOICES, PATIENCE)
+    assert page.session.scenario == mine and kept(browser).scenario == mine
+
+
+def test_two_pages_of_one_browser_keep_the_last_edit_and_complain_of_nothing(opened, robot, another):
+    browser = Browser()
+    one, other = opened(browser), Page(another, robot, kept=browser)
+    for page, warp in ((one, 0.9), (other, 0.8), (one, 0.7), (other, 0.6)):
+        page.session.edit("Warp", warp=warp)
+        settled(page)
+        assert kept(browser).scenario.warp == warp
+    assert message(one) == message(other) == ""
+    other.close()
+
+
+def test_what_is_not_kept_is_said_once_and_all_else_is_kept(opened):
+    browser = Browser()
+    page = opened(browser)
+    said = []
+    page.session.say = lambda text, severity: said.append(text)
+    ball, box = Sphere(PLACE), MeshObstacle(PLACE, Solid(*box_surface(np.full(3, 0.05))))
+    page.begin(changed(MADE, obstacles=(box, ball)))
+    settled(page)
+    page.session.edit("Warp", warp=0.5)
+    settled(page)
+    assert said == [keeping.OWN_SHAPES]
+    assert kept(browser).scenario == replace(changed(MADE, obstacles=(ball,)), warp=0.5)
+
+
+def test_a_task_of_own_demonstrations_leaves_what_was_kept_before(opened):
+    browser = Browser(**{KEY: made()})
+    page = opened(browser)
+    own, _ = page.session.bring(replace(TASKS["draw_s"](), name=""))
+    page.visitor._panel._titles[own.name] = own.title
+    page.session.choose_task(own.name)
+    settled(page)
+    assert message(page) == keeping.OWN_TASK and kept(browser).scenario == MADE
+    page.session.choose_task("draw_j")
+    settled(page)
+    assert kept(browser).scenario.task == "draw_j"
+
+
+def test_scenes_with_a_bottle_come_back_beside_the_event_loop(opened):
+    scene = SCENES["lift"].scenario(TASKS["lift_box"]())
+    page = opened(Browser(**{KEY: made(scenario=scene)}))
+    assert page.session.jobs.wait_idle(CHOICES, PATIENCE)
+    assert page.session.scenario == scene and page.session._screen.progress.restored == scene
+
+
+# --- the camera ---
+
+
+def drawn(page: Page, scenario: Scenario, stage: Stage) -> None:
+    """What the page does with the camera for a frame."""
+    frame = frame_of(scenario, stage=stage, task=TASKS[scenario.task]())
+    camera, keeper = page.visitor._camera, page.visitor._keeper
+    camera.look(frame.task)
+    if (sight := keeper.sight(frame)) is not None:
+        camera.choose((np.array(sight[0]), np.array(sight[1])))
+
+
+def assert_is_at(camera: Any, pose: Any) -> None:
+    np.testing.assert_allclose(camera, pose)
+
+
+def test_a_camera_that_is_moved_is_kept_and_one_that_is_not_is_none(opened):
+    browser = Browser()
+    page = opened(browser)
+    page.visitor._camera.look(TASKS["draw_s"]())
+    page.session.edit("Warp", warp=0.5)
+    settled(page)
+    assert kept(browser).camera is None
+    page.visitor._camera.view("Top")
+    settled(page)
+    top = view_of(TASKS["draw_s"](), page.visitor._camera.framing, "Top")
+    assert_is_at(kept(browser).camera, top)
+    page.visitor._camera.view("Home")
+    settled(page)
+    assert kept(browser).camera is None
+
+
+def test_the_camera_begins_where_it_was_and_goes_its_own_way_afterwards(opened):
+    page = opened(Browser(**{KEY: made(SIGHT)}))
+    seen = []
+    for scenario, stage in ((MADE, Stage.ROLLOUTS), (MADE, Stage.LIVE), (MADE, Stage.LIVE)):
+        drawn(page, scenario, stage)
+        seen.append((tuple(page.camera.position), tuple(page.camera.look_at)))
+    assert seen[0] == seen[1] == SIGHT  # panels stand beside the scene from the second stage on
+    assert seen[2] != SIGHT
+
+
+def test_the_camera_of_another_task_is_not_taken(opened):
+    page = opened(Browser(**{KEY: made(SIGHT)}))
+    drawn(page, Scenario("draw_s"), Stage.LIVE)
+    assert tuple(page.camera.position) != SIGHT[0]
