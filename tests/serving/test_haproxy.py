@@ -13,10 +13,11 @@ from pathlib import Path
 import pytest
 from demo import PATIENCE, address, started
 
-from dt_viz.evaluate.protocol_client import LostError, ProtocolClient
+from dt_viz.evaluate.protocol_client import OBSTACLE, LostError, ProtocolClient
 from dt_viz.serving.listening import listen
 
 CONFIGURATION = Path(__file__).parents[2] / "assets" / "serving" / "haproxy.cfg"
+PLACE = (0.1, -0.5, 0.345)
 HAPROXY = shutil.which("haproxy", path=os.pathsep.join([os.environ.get("PATH", ""), "/usr/sbin"]))
 pytestmark = pytest.mark.skipif(
     HAPROXY is None and not os.environ.get("DT_VIZ_REQUIRE_BROWSER"), reason="HAProxy is not installed"
@@ -49,8 +50,11 @@ async def until(condition):
         await asyncio.sleep(0.1)
 
 
-async def with_picture(stack, url):
-    client = await stack.enter_async_context(ProtocolClient(url, origin=url.replace("ws", "http")))
+async def with_picture(stack, url, storage=()):
+    """A visitor whose browser has kept something."""
+    client = ProtocolClient(url, origin=url.replace("ws", "http"))
+    client.storage.update(storage)
+    await stack.enter_async_context(client)
     await client.look()
     assert await client.wait_for(lambda: client.has_picture, PATIENCE)
     return client
@@ -69,13 +73,18 @@ async def visit(url, control, servers):
         for client in (first, second, third):
             assert not await client.wait_for(lambda client=client: client.lost, 1.0)  # and nobody is sent away
         command(control, "set server servers/one state ready")
+        await second.grab()
+        await second.move(PLACE)
+        await second.release()
+        await until(lambda: any("0.345" in text for text in second.storage.values()))
         servers[1].kill()
         for client in (second, third):
             with pytest.raises(LostError):
                 await client.wait_for(lambda: False, PATIENCE)
         await until(lambda: states(control)["two"][0] == "DOWN")
-        for _ in range(2):
-            await with_picture(stack, url)
+        again = await with_picture(stack, url, second.storage)
+        assert again.nodes[OBSTACLE]["position"] == pytest.approx(PLACE)  # where he had put it
+        await with_picture(stack, url)
         assert states(control)["one"][1] == 3
         assert not first.lost
 
