@@ -110,6 +110,7 @@ def _serve(options: argparse.Namespace) -> int:
         task=begin,
         host=options.host,
         max_sessions=options.max_sessions,
+        max_of_address=options.max_of_address,
         allowed=options.allow_origin,
     )
     prepare = partial(_prepare, fits, tasks[begin](), robot)
@@ -258,6 +259,12 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--lasa", type=Path, metavar="DIR", help="folder of LASA .mat files, each becomes a task")
     parser.add_argument(
         "--max-sessions", type=_positive, default=8, help="visitors at a time; others wait (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--max-of-address",
+        type=_positive,
+        metavar="N",
+        help="visitors of one address that is not this machine's (default: half of all; a room may share one)",
     )
     parser.add_argument(
         "--processes",

@@ -95,7 +95,8 @@ def test_own_files_are_the_task_that_the_page_begins_with(monkeypatch, tmp_path,
         path = np.stack([300 * s, 100 * s**2 + 10 * k, 200 - 50 * s], axis=1)
         np.savetxt(tmp_path / f"{k}.csv", path, delimiter=",", header="x,y,z", comments="")
 
-    def serve(tasks, _fits, robot, *_where, task, **_how):
+    def serve(tasks, _fits, robot, *_where, task, max_of_address, **_how):
+        assert max_of_address == 40
         assert robot.name == "jaco"
         shown = tasks[task]()
         assert (task, shown.title, len(shown.paths)) == ("own_data", "Own data", 2)
@@ -105,7 +106,12 @@ def test_own_files_are_the_task_that_the_page_begins_with(monkeypatch, tmp_path,
         raise GateError("it would be ready")
 
     monkeypatch.setattr(server, "Server", serve)
-    assert main([str(tmp_path), "--rate", "30", "--unit", "mm", "--port", "0", "--processes", "1"]) == 2
+    assert (
+        main(
+            [str(tmp_path), "--rate", "30", "--unit", "mm", "--max-of-address", "40", "--port", "0", "--processes", "1"]
+        )
+        == 2
+    )
     assert "it would be ready" in capsys.readouterr().err
     assert main([str(tmp_path), "--columns", "x,y"]) == 2
     assert "0.csv: columns: found 2 names for 3 columns; accepted: 3 names" in capsys.readouterr().err

@@ -52,7 +52,10 @@ FOREIGN: Refusal = (
     "Pages of other servers may not connect. To let one, start this server with --allow-origin and its address.",
 )
 FULL: Refusal = HTTPStatus.SERVICE_UNAVAILABLE, "All places are taken, and those to wait, too."
-CROWDED: Refusal = HTTPStatus.TOO_MANY_REQUESTS, "Too many pages are open from your address. Close one of them."
+CROWDED: Refusal = (
+    HTTPStatus.TOO_MANY_REQUESTS,
+    "Too many pages are open from your address. Close one, or have this server started with --max-of-address.",
+)
 STORED = "LocalStorageGetItemResponseMessage"
 """Message with what a browser has kept."""
 KINDS: Mapping[str, str] = {

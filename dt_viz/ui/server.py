@@ -57,6 +57,7 @@ class Server:
         port: int = 8080,
         max_sessions: int = 8,
         max_waiting: int = MAX_WAITING,
+        max_of_address: int | None = None,
         allowed: Sequence[Origin] = (),
     ) -> None:
         """Listen and wait for visitors.
@@ -72,6 +73,7 @@ class Server:
             port: port to listen on; 0 takes any free one.
             max_sessions: largest number of visitors; further ones wait until one leaves.
             max_waiting: largest number of those who wait; any more are refused.
+            max_of_address: largest number of visitors, also waiting ones, of one address; None is half of all.
             allowed: origins of other pages that may connect; see `Origins`.
 
         Raises:
@@ -93,7 +95,9 @@ class Server:
         """Number of pages that are being built, also for visitors who have left meanwhile."""
         self._closed = False
         connections = max_sessions + max_waiting
-        limits = Limits(max_sessions, connections, upload=MAX_UPLOAD, of_address=max(2, connections // 2))
+        limits = Limits(
+            max_sessions, connections, upload=MAX_UPLOAD, of_address=max_of_address or max(2, connections // 2)
+        )
         self._share = share or own_share(connections)
         self.gate = Gate(Origins(host, allowed), limits, _refuse, self._measured, self._share)
         self._server = self.gate.open(listening, "DT-Viz")

@@ -194,6 +194,7 @@ async def test_there_are_only_so_many_connections(url, server):
 @asynchronous
 async def test_no_address_takes_all_of_them(url, server, monkeypatch):
     """A proxy on this machine says who has connected to it; of IPv6 a network is one."""
+    assert server.gate.limits.of_address == (NUM_PLACES + MAX_WAITING) // 2
     monkeypatch.setattr(server.gate, "limits", replace(server.gate.limits, of_address=2))
     networks = [["203.0.113.7", "8.8.8.8, 203.0.113.7", "203.0.113.7"], ["2001:db8::1", "2001:db8::2", "2001:db8::3"]]
     async with AsyncExitStack() as stack:
