@@ -268,6 +268,7 @@ class Gate:
         Raises:
             GateError: viser does not start its server as expected.
         """
+        patches.tell_from_threads()
         patches.report_failures(lambda error: logger.error("a callback failed", exc_info=error))
         self._server = patches.open_server(self._guarded, listening, label=label, verbose=False)
         return self._server

@@ -5,10 +5,12 @@ Each function names the public hook that would replace it. What it needs is chec
 
 from __future__ import annotations
 
+import asyncio
+import functools
 import io
 import socket
 from collections.abc import Callable
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 from typing import Any
 
 import numpy as np
@@ -16,6 +18,7 @@ import viser
 import viser._messages
 import viser._scene_api
 import viser._viser
+import viser.infra._async_message_buffer
 import websockets.asyncio.server
 
 Options = Callable[[Any, dict[str, Any]], tuple[Any, dict[str, Any]]]
@@ -82,6 +85,31 @@ def report_failures(report: Callable[[BaseException], None]) -> None:
     for module in (viser._gui_api, viser._scene_api, viser._viser):
         for name in reports.keys() & vars(module):
             setattr(module, name, reports[name])
+
+
+class _Event(asyncio.Event):
+    """An event that is set by any thread, also while its loop wakes those who wait for it."""
+
+    def set(self) -> None:
+        with suppress(RuntimeError):  # who waits is woken at this moment, by the loop
+            super().set()
+
+
+def tell_from_threads() -> None:
+    """Let any thread queue messages, which fails rarely: viser sets an event of asyncio, made for one thread.
+
+    Hook: none is needed where viser does so on its loop alone.
+    """
+    buffer: Any = viser.infra._async_message_buffer.AsyncMessageBuffer
+    original = buffer.__init__
+
+    @functools.wraps(original)
+    def initialise(self: Any, *arguments: Any, **options: Any) -> None:  # noqa: ANN401
+        original(self, *arguments, **options)
+        self.message_event = _Event()
+
+    if not hasattr(original, "__wrapped__"):
+        buffer.__init__ = initialise
 
 
 def client_of(server: viser.ViserServer, connection: Any) -> viser.ClientHandle | None:  # noqa: ANN401

@@ -97,6 +97,7 @@ def test_a_cluster_that_loses_a_worker_writes_what_one_process_does(commands, cl
     assert len(killed) == 1
 
 
+@pytest.mark.slow
 def test_an_item_that_ends_its_worker_is_computed_again_and_one_that_ends_each_is_given_up(
     cluster, tmp_path, monkeypatch
 ):

@@ -8,7 +8,7 @@ import os
 import socket
 import urllib.error
 import urllib.request
-from contextlib import AsyncExitStack, asynccontextmanager, closing
+from contextlib import AsyncExitStack, asynccontextmanager, closing, nullcontext
 from dataclasses import replace
 from time import monotonic
 
@@ -548,6 +548,20 @@ def test_a_viser_that_serves_in_another_way_is_refused(monkeypatch):
     ):
         a_gate().open(listening, "")
     assert stopped
+
+
+@asynchronous
+async def test_a_thread_may_tell_something_while_the_loop_wakes_who_waits(server):
+    class Waking(list):
+        def __iter__(self):
+            raise RuntimeError("deque mutated during iteration")
+
+    buffer = viser.infra._async_message_buffer.AsyncMessageBuffer(asyncio.get_running_loop(), persistent_messages=False)
+    for event in (buffer.message_event, asyncio.Event()):
+        event._waiters = Waking()
+        with nullcontext() if event is buffer.message_event else pytest.raises(RuntimeError):
+            event.set()
+        assert event.is_set()
 
 
 def test_a_viser_with_other_messages_is_refused(monkeypatch):
