@@ -230,7 +230,7 @@ class Page:
                     await coroutine
 
         self._loop.run_until_complete(one_after_the_other())
-        self.session.wait_idle(10)
+        assert self.session.wait_idle(PATIENCE)
 
     def claim(self, handle: Any, value: Any) -> None:
         if isinstance(value, viser.UploadedFile):  # an upload can be sent to any input

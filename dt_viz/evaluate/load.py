@@ -38,6 +38,7 @@ import sys
 import time
 from collections.abc import Awaitable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AsyncExitStack, contextmanager, suppress
+from enum import Enum, auto
 from pathlib import Path
 from typing import Any
 
@@ -57,10 +58,8 @@ from dt_viz.evaluate.options import (
 )
 from dt_viz.evaluate.protocol_client import LostError, ProtocolClient
 from dt_viz.evaluate.visit import SETTINGS, Visit, places_of, spread
+from dt_viz.obstacles.shapes import Point
 from dt_viz.scenario.tasks import Task
-
-LECTURE, DRAGS, CHANGES = 20, (0, 4, 8, 12, 16), 2
-"""Number of visitors in a part of a lecture, and which of them drag, and change the task; the others look on."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -117,8 +116,12 @@ async def _visited(
         visits, num_edits = [*map(Visit, clients)], max(1, round(SETTINGS.edits_per_second * options.seconds))
         before, num_before = _used(process), sum(client.num_messages for client in clients)
         began = time.perf_counter()
-        doings = [_doing(options, visit, task, k, num_edits) for k, visit in enumerate(visits)]
-        await asyncio.gather(*(_measured(visit, doing) for visit, doing in zip(visits, doings, strict=True)))
+        roles = [role_of(options, k) for k in range(number)]
+        doings = (
+            _doing(options, visit, role, places_of(task, k, num_edits))
+            for k, (visit, role) in enumerate(zip(visits, roles, strict=True))
+        )
+        await asyncio.gather(*map(_measured, visits, doings))
         elapsed, after = time.perf_counter() - began, _used(process)
         num_messages = sum(client.num_messages for client in clients) - num_before
         for visit in visits:
@@ -129,8 +132,8 @@ async def _visited(
         seconds = num_edits / SETTINGS.edits_per_second
         return figures | {
             "visitors": [
-                visit.figures(seconds) if drags else {"lost": visit.lost}
-                for visit, drags in zip(visits, _who_drag(options, number), strict=True)
+                visit.figures(seconds) if role in DRAGS else {"lost": visit.lost}
+                for visit, role in zip(visits, roles, strict=True)
             ],
             "ping_ms": spread(np.array([ping for visit in visits for ping in visit.pings])),
             "messages_per_s": num_messages / number / elapsed,
@@ -156,23 +159,35 @@ async def _first_picture(
     return None
 
 
-def _doing(options: argparse.Namespace, visit: Visit, task: Task, number: int, num_edits: int) -> Awaitable[None]:
-    """Return what the visitor with this number does: drag, change the task, or look on."""
-    places = places_of(task, number, num_edits)
-    if not (options.rest or options.lecture):
+class _Role(Enum):
+    """What a visitor does."""
+
+    DRAG = auto()
+    DRAG_IN_BURSTS = auto()
+    CHANGE_TASK = auto()
+    LOOK_ON = auto()
+
+
+DRAGS = (_Role.DRAG, _Role.DRAG_IN_BURSTS)
+
+
+def role_of(options: argparse.Namespace, number: int) -> _Role:
+    """Return what the visitor with this number does."""
+    if not options.lecture:
+        return _Role.LOOK_ON if options.rest else _Role.DRAG
+    turn = number % SETTINGS.lecture
+    if turn in SETTINGS.dragging:
+        return _Role.DRAG_IN_BURSTS
+    return _Role.CHANGE_TASK if turn in SETTINGS.changing else _Role.LOOK_ON
+
+
+def _doing(options: argparse.Namespace, visit: Visit, role: _Role, places: Sequence[Point]) -> Awaitable[None]:
+    """Return what a visitor does in its role, where it drags through places."""
+    if role is _Role.DRAG:
         return visit.drag(places)
-    turn = number % LECTURE
-    if options.rest or turn not in (*DRAGS, CHANGES):
-        return asyncio.sleep(options.seconds)
-    if turn == CHANGES:
-        return visit.change_task(options.seconds)
-    part = SETTINGS.burst / (SETTINGS.burst + SETTINGS.pause)
-    return visit.drag_in_bursts(places[: round(part * num_edits)], SETTINGS.pause * number / options.visitors[-1])
-
-
-def _who_drag(options: argparse.Namespace, number: int) -> list[bool]:
-    """Return which of the visitors drag."""
-    return [not options.rest and (not options.lecture or k % LECTURE in DRAGS) for k in range(number)]
+    if role is _Role.DRAG_IN_BURSTS:
+        return visit.drag_in_bursts(places)
+    return visit.change_task(options.seconds) if role is _Role.CHANGE_TASK else asyncio.sleep(options.seconds)
 
 
 async def _measured(visit: Visit, doing: Awaitable[None]) -> None:

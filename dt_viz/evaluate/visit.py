@@ -37,6 +37,12 @@ class LoadSettings:
     """Time that somebody in a lecture drags."""
     pause: float = 4.0
     """Time from there to the next drag, and from one change of the task to the next."""
+    lecture: int = 20
+    """Number of visitors of a lecture after which roles come again."""
+    dragging: tuple[int, ...] = (0, 4, 8, 12, 16)
+    """Which of them drag."""
+    changing: tuple[int, ...] = (2,)
+    """Which of them change the task; the others look on."""
     answered: float = 0.5
     """Time within which an edit counts as answered."""
 
@@ -82,11 +88,11 @@ class Visit:
             await self.client.move(place)
         await self.client.release()
 
-    async def drag_in_bursts(self, places: Sequence[Point], delay: float) -> None:
-        """Drag the obstacle through places, with pauses, from some delay on, seconds."""
-        await asyncio.sleep(delay)
+    async def drag_in_bursts(self, places: Sequence[Point]) -> None:
+        """Drag the obstacle through some of the places, with pauses, in the time that all of them would take."""
         size = round(SETTINGS.edits_per_second * SETTINGS.burst)
-        for begin in range(0, len(places), size):
+        step = size + round(SETTINGS.edits_per_second * SETTINGS.pause)
+        for begin in range(0, len(places), step):
             await self.drag(places[begin : begin + size])
             await asyncio.sleep(SETTINGS.pause)
 

@@ -26,24 +26,31 @@ from dt_viz.serving.listening import HandedOver, hand_over
 
 logger = logging.getLogger(__name__)
 
-TICK = 0.1
-"""Time between two looks at the processes, seconds."""
-RECENT = 1.0
-"""Time for which a connection that was handed over counts, as it may not be on the board yet, seconds."""
-HESITATION = 1.0
-"""Time without a beat after which a process gets connections only if all others hesitate, too, seconds."""
-SILENCE = 10.0
-"""Time without a beat after which a process counts as stuck, seconds: compiling holds it up for some."""
-PATIENCE = 2.5
-"""Time that processes have to end before they are killed, seconds."""
-RESTART = 0.5
-"""Time from one start of a process to the next one in its place, seconds, at least."""
-MAX_REQUESTS = 256
-"""Largest number of accepted connections that have not said yet what they want."""
-REQUEST = 10.0
-"""Time that they have for it, seconds."""
-REQUEST_BYTES = 4096
-"""Number of bytes of a request that are looked at."""
+
+@dataclass(frozen=True)
+class SupervisorSettings:
+    """How long processes and connections are waited for; times in seconds."""
+
+    tick: float = 0.1
+    """Time between two looks at the processes."""
+    recent: float = 1.0
+    """Time for which a connection that was handed over counts, as it may not be on the board yet."""
+    hesitation: float = 1.0
+    """Time without a beat after which a process gets connections only if all others hesitate, too."""
+    silence: float = 10.0
+    """Time without a beat after which a process counts as stuck: compiling holds it up for some."""
+    patience: float = 2.5
+    """Time that processes have to end before they are killed."""
+    restart: float = 0.5
+    """Shortest time from one start of a process to the next one in its place."""
+    request: float = 10.0
+    """Time that an accepted connection has to say what it wants."""
+    max_requests: int = 256
+    """Largest number of those that have not said it yet."""
+    looked_at: int = 4096
+    """Number of bytes of a request that are looked at."""
+
+
 UPGRADE = b"upgrade: websocket"
 
 Work = Callable[[Share, HandedOver], int]
@@ -69,14 +76,19 @@ class _Worker:
     """Where connections are handed to it."""
     started: float
     handed: deque[float] = field(default_factory=deque)
-    """When connections were handed to it, those within `RECENT`."""
+    """When connections were handed to it, those that are recent."""
 
 
 class Supervisor:
     """Runs several processes that serve one address."""
 
     def __init__(
-        self, listening: socket.socket, board: Board, work: Work, ready: Callable[[], None] = lambda: None
+        self,
+        listening: socket.socket,
+        board: Board,
+        work: Work,
+        ready: Callable[[], None] = lambda: None,
+        settings: SupervisorSettings = SupervisorSettings(),
     ) -> None:
         """Take an address, a board with a row for each process, and what each does.
 
@@ -85,8 +97,10 @@ class Supervisor:
             board: its number of rows is that of the processes.
             work: runs in each process, until KeyboardInterrupt.
             ready: called once, when the first process serves.
+            settings: how long it waits.
         """
         self._listening, self._board, self._work, self._ready = listening, board, work, ready
+        self._settings = settings
         self._workers: list[_Worker | None] = [None] * len(board.rows)
         self._asking: dict[socket.socket, float] = {}
         """Accepted connections that have not said yet what they want, and when they came."""
@@ -103,7 +117,7 @@ class Supervisor:
         self._selector.register(self._listening, selectors.EVENT_READ)
         try:
             while not (status := self._look_after()):
-                for key, _ in self._selector.select(TICK):
+                for key, _ in self._selector.select(self._settings.tick):
                     if key.fileobj is self._listening:
                         self._accept()
                     else:
@@ -118,7 +132,7 @@ class Supervisor:
                 connection, _ = self._listening.accept()
             except OSError:  # none waits, or it has left, or there are too many files
                 return
-            if len(self._asking) >= MAX_REQUESTS:
+            if len(self._asking) >= self._settings.max_requests:
                 connection.close()
                 continue
             connection.setblocking(False)
@@ -128,7 +142,7 @@ class Supervisor:
     def _dispatch(self, connection: socket.socket) -> None:
         """Hand a connection that asks for something to the process with the fewest."""
         try:
-            request = connection.recv(REQUEST_BYTES, socket.MSG_PEEK)
+            request = connection.recv(self._settings.looked_at, socket.MSG_PEEK)
         except OSError:
             request = b""
         if not request:
@@ -136,6 +150,8 @@ class Supervisor:
             connection.close()
             return
         running = [k for k, worker in enumerate(self._workers) if worker is not None and worker.process.is_alive()]
+        if not running:
+            return  # it is served as soon as another one has begun
         for k in sorted(running, key=self._load):
             worker = self._workers[k]
             assert worker is not None
@@ -151,9 +167,9 @@ class Supervisor:
         """Return whether a process hesitates, and its number of connections, with those it was handed a moment ago."""
         worker, row, now = self._workers[number], self._board.rows[number], time.monotonic()
         assert worker is not None
-        while worker.handed and worker.handed[0] < now - RECENT:
+        while worker.handed and worker.handed[0] < now - self._settings.recent:
             worker.handed.popleft()
-        return now - row["beat"] > HESITATION, int((row["connections"] != 0).sum()) + len(worker.handed)
+        return now - row["beat"] > self._settings.hesitation, int((row["connections"] != 0).sum()) + len(worker.handed)
 
     def _forget(self, connection: socket.socket) -> None:
         if self._asking.pop(connection, None) is not None:
@@ -166,7 +182,7 @@ class Supervisor:
             Exit status of a process that could not even begin, and would not the next time; 0 without any.
         """
         now = time.monotonic()
-        for connection in [one for one, came in self._asking.items() if now - came > REQUEST]:
+        for connection in [one for one, came in self._asking.items() if now - came > self._settings.request]:
             self._forget(connection)
             connection.close()
         for number, worker in enumerate(self._workers):
@@ -176,11 +192,11 @@ class Supervisor:
                 status = worker.process.exitcode or 0
                 if status > 0 and not self._has_run(number, worker):
                     return status
-                if now - worker.started > RESTART:
+                if now - worker.started > self._settings.restart:
                     logger.warning("process %d has ended (%d): another one takes its place", worker.process.pid, status)
                     worker.channel.close()
                     self._start(number)
-            elif now - self._board.rows[number]["beat"] > SILENCE:
+            elif now - self._board.rows[number]["beat"] > self._settings.silence:
                 logger.warning("process %d does not answer: it is ended", worker.process.pid)
                 worker.process.kill()
             elif not self._is_ready and self._has_run(number, worker):
@@ -210,6 +226,7 @@ class Supervisor:
         for connection in inherited:
             connection.close()
         self._selector.close()
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all, and the parent ends this one
         parent = multiprocessing.parent_process()
         assert parent is not None
         threading.Thread(target=_end_after, args=(parent.sentinel,), daemon=True).start()
@@ -217,12 +234,12 @@ class Supervisor:
             sys.exit(self._work(Share(self._board, number), HandedOver(theirs, address)))
 
     def _end(self) -> None:
-        """End all processes, also those that do not listen to reason."""
+        """End all processes, by force where they do not end in time."""
         self._listening.close()
         processes = [worker.process for worker in self._workers if worker is not None]
         for process in processes:
             process.terminate()
-        deadline = time.monotonic() + PATIENCE
+        deadline = time.monotonic() + self._settings.patience
         for process in processes:
             process.join(max(0.0, deadline - time.monotonic()))
             if process.is_alive():

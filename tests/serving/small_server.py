@@ -6,15 +6,13 @@ import signal
 import sys
 from contextlib import suppress
 
-from dt_viz.serving import supervisor
 from dt_viz.serving.board import Board, Share
 from dt_viz.serving.listening import HandedOver, listen
-from dt_viz.serving.supervisor import Supervisor
+from dt_viz.serving.supervisor import Supervisor, SupervisorSettings
 
 
 def main(kind: str = "", silence: str = "10") -> int:
     """Serve until SIGTERM; `kind` is what goes wrong."""
-    supervisor.SILENCE = float(silence)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
 
     def work(share: Share, listening: HandedOver) -> int:
@@ -31,7 +29,7 @@ def main(kind: str = "", silence: str = "10") -> int:
         print(listening.getsockname()[1], flush=True)
 
     try:
-        return Supervisor(listening, Board(2, 100), work, ready).run()
+        return Supervisor(listening, Board(2, 100), work, ready, SupervisorSettings(silence=float(silence))).run()
     except KeyboardInterrupt:
         return 0
 
