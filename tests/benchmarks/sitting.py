@@ -54,7 +54,7 @@ SUBJECTS: Mapping[str, Subject] = {
     ),
     "load": Subject(
         "Visitors at once",
-        ("load --clients 1 4 8 --seconds 20", "load --task push_box --rest --clients 1 --seconds 40"),
+        ("load --visitors 1 4 8 --seconds 20", "load --task push_box --rest --visitors 1 --seconds 40"),
         ".json",
     ),
     "scenes": Subject("Scenes of the paper", ("scenes",), ".json"),
