@@ -18,6 +18,7 @@ import pytest
 import viser  # noqa: TID251 - whose version the page has
 import websockets
 from pages import wait_until
+from viser.infra._async_message_buffer import AsyncMessageBuffer  # noqa: TID251
 from websockets.asyncio.client import connect
 from websockets.typing import Subprotocol
 
@@ -551,14 +552,14 @@ def test_a_viser_that_serves_in_another_way_is_refused(monkeypatch):
 
 
 @asynchronous
-async def test_a_thread_may_tell_something_while_the_loop_wakes_who_waits(server):
+async def test_a_thread_may_tell_something_while_the_loop_wakes_who_waits(server, monkeypatch):
     class Waking(list):
         def __iter__(self):
             raise RuntimeError("deque mutated during iteration")
 
-    buffer = viser.infra._async_message_buffer.AsyncMessageBuffer(asyncio.get_running_loop(), persistent_messages=False)
+    buffer = AsyncMessageBuffer(asyncio.get_running_loop(), persistent_messages=False)
     for event in (buffer.message_event, asyncio.Event()):
-        event._waiters = Waking()
+        monkeypatch.setattr(event, "_waiters", Waking())
         with nullcontext() if event is buffer.message_event else pytest.raises(RuntimeError):
             event.set()
         assert event.is_set()
