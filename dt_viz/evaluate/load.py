@@ -40,7 +40,7 @@ from collections.abc import Awaitable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AsyncExitStack, contextmanager, suppress
 from enum import Enum, auto
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -114,7 +114,7 @@ async def _visited(
             return figures
         await asyncio.sleep(SETTINGS.settled)
         visits, num_edits = [*map(Visit, clients)], max(1, round(SETTINGS.edits_per_second * options.seconds))
-        before, num_before = _used(process), sum(client.num_messages for client in clients)
+        before, num_before = used(process), sum(client.num_messages for client in clients)
         began = time.perf_counter()
         roles = [role_of(options, k) for k in range(number)]
         doings = (
@@ -122,7 +122,7 @@ async def _visited(
             for k, (visit, role) in enumerate(zip(visits, roles, strict=True))
         )
         await asyncio.gather(*map(_measured, visits, doings))
-        elapsed, after = time.perf_counter() - began, _used(process)
+        elapsed, after = time.perf_counter() - began, used(process)
         num_messages = sum(client.num_messages for client in clients) - num_before
         for visit in visits:
             if not visit.sent:
@@ -218,30 +218,44 @@ def _server(options: argparse.Namespace, number: int) -> Iterator[tuple[str, int
     if options.url is not None:
         yield options.url, None
         return
-    arguments = ["--port", "0", "--task", options.task, "--max-sessions", str(number)]
+    arguments = ["--task", options.task, "--max-sessions", str(number)]
     if options.processes is not None:
         arguments += ["--processes", str(options.processes)]
     if options.lasa is not None:
         arguments += ["--lasa", str(options.lasa)]
+    with started(arguments) as (url, process):
+        yield url, process
+
+
+@contextmanager
+def started(arguments: Sequence[str], log: IO[str] | None = None) -> Iterator[tuple[str, int]]:
+    """Start a server on a free port; yield the address of its WebSocket, and its process.
+
+    Args:
+        arguments: options of `dt-viz`.
+        log: file that its log is written to; None for this process' own.
+
+    Raises:
+        FormatError: it does not start.
+    """
     program = "from dt_viz.cli import main; raise SystemExit(main())"
-    with subprocess.Popen(
-        [sys.executable, "-c", program, *arguments], stdout=subprocess.PIPE, text=True, encoding="utf-8"
-    ) as process:
+    command = [sys.executable, "-c", program, "--port", "0", *arguments]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, encoding="utf-8") as process:
         try:
             assert process.stdout is not None
             found = (re.search(r"DT-Viz is at http://(\S+)", line) for line in process.stdout)
             address = next((match[1] for match in found if match), None)
             if address is None:
-                raise FormatError("--task", "a server that does not start", "one that does: see above")
+                raise FormatError(" ".join(arguments), "a server that does not start", "one that does: see above")
             yield f"ws://{address}", process.pid
         finally:
             process.terminate()
 
 
-def _used(process: int | None) -> tuple[float, float] | None:
-    """Processor time of a process and of all it has started, s, and their memory, MB, what they share counted once.
+def used(process: int | None) -> tuple[float, float] | None:
+    """Return the processor time of a process and of all it has started, s, and their memory, MB, shared memory once.
 
-    None if it is gone or the system does not say.
+    Returns None if it is gone or the system does not say.
     """
     if process is None:
         return None

@@ -52,6 +52,8 @@ class SupervisorSettings:
 
 
 UPGRADE = b"upgrade: websocket"
+ENDS = (signal.SIGINT, signal.SIGTERM)
+"""Signals that end the server."""
 
 Work = Callable[[Share, HandedOver], int]
 """What each process does until it is interrupted, with its row of the board, and with the connections that it gets;
@@ -215,9 +217,14 @@ class Supervisor:
         started = float(self._board.rows[number]["beat"])
         context = multiprocessing.get_context("fork")
         process = context.Process(target=self._run, args=(number, ours, theirs), name=f"dt-viz {number}")
-        process.start()
-        theirs.close()
-        self._workers[number] = _Worker(process, ours, started)
+        # what a signal's handler raises while Python forks is ignored, and so would be the signal
+        signal.pthread_sigmask(signal.SIG_BLOCK, ENDS)
+        try:
+            process.start()
+            theirs.close()
+            self._workers[number] = _Worker(process, ours, started)
+        finally:
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDS)
 
     def _run(self, number: int, ours: socket.socket, theirs: socket.socket) -> None:
         """Do the work, in a new process."""
@@ -231,6 +238,7 @@ class Supervisor:
         assert parent is not None
         threading.Thread(target=_end_after, args=(parent.sentinel,), daemon=True).start()
         with suppress(KeyboardInterrupt):
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDS)
             sys.exit(self._work(Share(self._board, number), HandedOver(theirs, address)))
 
     def _end(self) -> None:

@@ -25,6 +25,37 @@ from tests.benchmarks.exactness import MAX_DEPARTURE, compare, stepped_adaptivel
 from tests.benchmarks.latency import Recorder
 from tests.benchmarks.learning import off_course
 from tests.benchmarks.sitting import Subject
+from tests.benchmarks.soak import Soaked
+
+# --- soak ---
+
+FIRST, SECOND, THIRD, MOVED = (("task", "arm", (x, 0.0, 0.0)) for x in (0.1, 0.2, 0.3, 0.4))
+
+
+@pytest.mark.parametrize(
+    ("found", "num_lost", "ages"),
+    [
+        (MOVED, 0, [0.0]),
+        (THIRD, 0, [0.5]),  # the last edit, in part
+        (SECOND, 0, [1.5]),  # the one before, whole
+        (FIRST, 1, [2.5]),  # the one before, in part
+        (("task", "arm", (0.5, 0.0, 0.0)), 1, []),  # what never was
+        (("task", "hand", MOVED[2]), 1, []),
+    ],
+)
+def test_the_edit_before_the_last_one_must_be_found_again_whole(found, num_lost, ages):
+    visitor = Soaked("", 0, lambda: 0.0)
+    visitor.had = [(10.0, 4, FIRST), (11.0, 4, SECOND), (12.0, 5, THIRD), (13.0, 5, MOVED), (14.0, 5, FIRST)]
+    visitor.compare(found, lost=13.5)
+    assert (visitor.num_lost, visitor.ages, visitor.num_unknown) == (num_lost, ages, 0)
+
+
+def test_what_is_found_again_just_after_a_choice_is_not_compared():
+    visitor = Soaked("", 0, lambda: 0.0)
+    visitor.had = [(10.0, 4, FIRST), (11.0, 5, None)]
+    visitor.compare(SECOND, lost=11.5)
+    assert (visitor.num_lost, visitor.ages, visitor.num_unknown) == (0, [], 1)
+
 
 # --- latency, drag, scenes ---
 

@@ -23,6 +23,8 @@ def main(kind: str = "", silence: str = "10") -> int:
         asyncio.run(serve(share, listening))
         return 0
 
+    if kind == "signalled":
+        os.register_at_fork(after_in_parent=lambda: os.kill(os.getpid(), signal.SIGTERM))
     listening = listen("127.0.0.1", 0)
 
     def ready() -> None:

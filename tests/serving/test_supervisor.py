@@ -149,6 +149,13 @@ def test_processes_that_cannot_begin_end_all_with_their_status():
     assert subprocess.run(program, check=False, timeout=PATIENCE).returncode == 3
 
 
+def test_a_signal_while_a_process_is_forked_ends_all_in_time():
+    result = subprocess.run(
+        [sys.executable, str(SMALL), "signalled"], check=False, timeout=PATIENCE, capture_output=True
+    )
+    assert (result.returncode, result.stdout, result.stderr) == (0, b"", b"")
+
+
 @pytest.mark.parametrize("kind", ["", "stubborn"])
 def test_a_signal_ends_all_in_time(kind):
     with serving(kind) as (process, visits):
