@@ -21,6 +21,7 @@ from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Stage
 from tests.benchmarks import drag, exactness, latency, sitting
 from tests.benchmarks.__main__ import main
+from tests.benchmarks.capacity import Cost, simulated
 from tests.benchmarks.exactness import MAX_DEPARTURE, compare, stepped_adaptively, stepped_beside
 from tests.benchmarks.latency import Recorder
 from tests.benchmarks.learning import off_course
@@ -55,6 +56,26 @@ def test_what_is_found_again_just_after_a_choice_is_not_compared():
     visitor.had = [(10.0, 4, FIRST), (11.0, 5, None)]
     visitor.compare(SECOND, lost=11.5)
     assert (visitor.num_lost, visitor.ages, visitor.num_unknown) == (0, [], 1)
+
+
+# --- capacity ---
+
+
+@pytest.mark.parametrize("num_visitors", [1, 4, 12])
+def test_a_simulated_process_answers_as_many_in_time_as_on_paper_while_it_has_time(num_visitors):
+    cost = Cost(picture=0.04, looking=0.01, dragging=0.05)
+    for within in (0.1, 0.5):
+        part = simulated(cost, num_visitors, within, np.random.default_rng(num_visitors))
+        assert part == pytest.approx(cost.answered(num_visitors, within), abs=0.12)
+
+
+def test_more_visitors_of_a_process_are_answered_later_until_it_has_no_time_at_all():
+    cost = Cost(picture=0.04, looking=0.02, dragging=0.1)
+    parts = [cost.answered(number, 0.5) for number in range(1, 51)]
+    assert parts[0] == pytest.approx(1) and max(np.diff(parts)) < 1e-12 and parts[-1] == 0
+    largest = cost.largest(0.95, 0.5)
+    assert parts[largest - 1] >= 0.95 > parts[largest]
+    assert Cost(picture=0.6, looking=0.0, dragging=0.1).largest(0.95, 0.5) == 0
 
 
 # --- latency, drag, scenes ---
