@@ -50,6 +50,7 @@ ONLY_IMPORTERS: Mapping[str, set[str]] = {
     "ompl": {"baselines/mpnet_rrt.py"},
     "joblib": {"evaluate/sweep.py"},
     "distributed": {"evaluate/sweep.py"},
+    "prometheus_client": {"serving/reports.py"},
     "jax": set(),
     "numba": {"kernels/compiled.py"},
     "pickle": {"kernels/compiled.py"},

@@ -81,8 +81,8 @@ class Session:
         """Whether the learning of the scenario was cancelled, and there is no other to go back to."""
         self._shown: Frame | None = None
         """The newest frame; None before the first one."""
-        self._num_skipped = 0
-        """Edits that a newer one overtook."""
+        self._num_skipped = self._num_edits = 0
+        """Edits that a newer one overtook, and all."""
         self.jobs = Jobs(self.fail)
         """All work of the visitor beside the server's event loop."""
         self._adopt()
@@ -336,6 +336,7 @@ class Session:
         engine = self.engines.get(self.scenario.arm)
         if engine is not None:
             engine.see(self.scenario)
+        self._num_edits += 1
         compute = partial(self._compute, self.scenario, time.perf_counter())
         self._num_skipped += self.jobs.submit(LANE, compute, latest=True)
 
@@ -386,7 +387,7 @@ class Session:
             self._shown = frame
             if frame.stage is Stage.ROLLOUTS and drawn:
                 continue  # it is only looked at in another way: the next stage is what changes
-            self._screen.draw(frame, edited, self._num_skipped)
+            self._screen.draw(frame, edited, self._num_skipped, self._num_edits)
             if frame.stage in (Stage.ROLLOUTS, Stage.FINE):
                 engine.drive(frame)
             if frame.stage is Stage.LIVE:

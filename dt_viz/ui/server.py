@@ -83,7 +83,7 @@ class Server:
         listening = listening or listen(host, port)
         titles, arms = {name: entry.title for name, entry in tasks.items()}, ArmStore(tasks, fits, robot)
         self._new_visitor: Callable[[viser.ClientHandle], Visitor] = lambda client: Visitor(
-            client, arms.engine(), robot, titles, task, arms
+            client, arms.engine(), robot, titles, task, arms, self._share
         )
         self._max_sessions = max_sessions
         self._lock = threading.Condition()

@@ -18,6 +18,7 @@ from dt_viz.robot.robot import Robot
 from dt_viz.scenario.saved import Known, Saved
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import with_avoidance
+from dt_viz.serving.board import Share
 from dt_viz.session.arms import ArmStore
 from dt_viz.session.comparison import OTHERS
 from dt_viz.session.engine import Engine
@@ -25,6 +26,7 @@ from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.opening import Preview
 from dt_viz.session.progress import Display, Pace, Progress
 from dt_viz.session.session import Session
+from dt_viz.ui.counting import Counted
 from dt_viz.ui.keeping import Keeper
 from dt_viz.ui.panel import ControlPanel
 from dt_viz.ui.playback import Playback
@@ -64,8 +66,12 @@ class Visitor(Display):
         titles: Mapping[str, str],
         task: str,
         arms: ArmStore | None = None,
+        share: Share | None = None,
     ) -> None:
-        """Build the page for an engine of its own and start computing; there is one arm where there are no `arms`."""
+        """Build the page for an engine of its own and start computing; there is one arm where there are no `arms`.
+
+        Edits and pictures are counted in the `share` of this process, if there is one.
+        """
         self.client = client
         self.shown: Frame | None = None
         """The last drawn frame."""
@@ -95,7 +101,8 @@ class Visitor(Display):
         )
         begun = self._keeper.begun
         at_once = None if begun is None or _takes_long(begun.scenario) else begun.scenario
-        self.session = Session(engine, initial_scenario, task, self, arms and arms.engine, at_once)
+        display = self if share is None else Counted(self, share)
+        self.session = Session(engine, initial_scenario, task, display, arms and arms.engine, at_once)
         self._panel.connect(self.session)
         self._keeper.begin(self.session, self._resume)
         if begun is not None and at_once is None:

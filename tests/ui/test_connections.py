@@ -170,6 +170,39 @@ def test_the_page_is_not_given_out_under_such_a_name_either(url, server):
     assert b"--allow-origin" in refused.value.read()
 
 
+def told_to_prometheus(server, host="127.0.0.1"):
+    """Status of the answer, and its values by their names."""
+    request = urllib.request.Request(f"http://127.0.0.1:{server.port}/metrics", headers={"Host": host})
+    try:
+        with urllib.request.urlopen(request) as answer:
+            lines = [line.rsplit(" ", 1) for line in answer.read().decode().splitlines() if line[0] != "#"]
+            return answer.status, {name: float(value) for name, value in lines}
+    except urllib.error.HTTPError as error:
+        return error.code, {}
+
+
+@asynchronous
+async def test_prometheus_is_told_what_visitors_do_and_nobody_is_under_a_foreign_name(url, server):
+    pytest.importorskip("prometheus_client")
+    assert (await asyncio.to_thread(told_to_prometheus, server, "evil.example"))[0] == 421
+    status, before = await asyncio.to_thread(told_to_prometheus, server)
+    async with visiting(url) as client:
+        await client.grab()
+        for k in range(5):
+            await client.move((0.1, -0.5, 0.345 + 0.01 * k))
+            await asyncio.sleep(0.3)
+        await client.release()
+        assert await answers(client)
+        _, after = await asyncio.to_thread(told_to_prometheus, server)
+    assert await status_of(url, origin="https://evil.example") == 403
+    _, refused = await asyncio.to_thread(told_to_prometheus, server)
+    assert status == 200 and before["dt_viz_visitors"] == 0 and after["dt_viz_visitors"] == 1
+    grown = {name: after[f"dt_viz_{name}"] - before[f"dt_viz_{name}"] for name in ("edits_total", "frames_total")}
+    assert 6 <= grown["edits_total"] <= 8 and 2 <= grown["frames_total"] <= grown["edits_total"]
+    assert after["dt_viz_latency_seconds_sum"] > before["dt_viz_latency_seconds_sum"]
+    assert refused["dt_viz_refused_requests_total"] == after["dt_viz_refused_requests_total"] + 1
+
+
 @asynchronous
 async def test_a_page_of_another_version_is_told_so_as_viser_does(url, capfd):
     async with connect(url, subprotocols=[Subprotocol("viser-v0.0.1")], proxy=None) as client:
