@@ -3,8 +3,6 @@
 import multiprocessing
 import os
 import signal
-import sys
-from threading import Thread
 
 import pytest
 
@@ -78,18 +76,6 @@ def test_counts_only_grow_also_where_a_process_takes_the_place_of_another(board,
     assert counts["latencies"].tolist() == [0, 0, 2, *[0] * 7]
     Share(board, 1).edited(1)
     assert shares[0].counts["edits"] == 7
-
-
-def test_threads_that_count_at_once_lose_nothing(shares):
-    interval = sys.getswitchinterval()
-    sys.setswitchinterval(1e-6)
-    threads = [Thread(target=lambda: [shares[0].answered(0.03) for _ in range(2000)]) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    sys.setswitchinterval(interval)
-    assert shares[1].counts["latencies"].sum() == 8000
 
 
 def test_the_first_process_prepares_then_all_others(shares):
