@@ -89,7 +89,7 @@ def run(options: argparse.Namespace) -> int:
     print(f"{task.name}; a fixed piece of numpy work takes {unit:.1f} ms")
     visits = []
     for number in options.visitors:
-        with _server(options, number) as (url, process):
+        with started(options, number) as (url, process):
             visits.append(asyncio.run(_visited(options, url, process, task, number)))
     report([_row(figures) for figures in visits])
     if out is not None:
@@ -213,7 +213,7 @@ async def _measured(visit: Visit, doing: Awaitable[None]) -> None:
 
 
 @contextmanager
-def _server(options: argparse.Namespace, number: int) -> Iterator[tuple[str, int | None]]:
+def started(options: argparse.Namespace, number: int) -> Iterator[tuple[str, int | None]]:
     """Yield the address of the WebSocket, and the server's process if it is started here."""
     if options.url is not None:
         yield options.url, None

@@ -118,6 +118,13 @@ class Engine:
             ImitationError: nothing can be learned from them.
             UnwantedError: it is cancelled.
         """
+        given = progress
+
+        def progress(fraction: float, message: str) -> None:
+            _cores.give_way()
+            if given is not None:
+                given(fraction, message)
+
         self.nominal(scenario, progress)
         shown = [panel.shown for panel in scenario.view.panels if panel.shown]
         others = {panel: Scenario(panel.task, state=panel.state, arm=scenario.arm) for panel in shown}
@@ -320,7 +327,7 @@ class Engine:
         """The last frame again and again, each with more of what is known of other methods."""
         if not frame.scenario.view.compared:
             return
-        left = self.comparison.complete(frame, self._plain(frame.scenario), cancelled)
+        left = self.comparison.complete(frame, self._plain(frame.scenario), _cores.giving_way(cancelled))
         while True:
             with _cores.slot(cancelled):
                 notes = next(left, None)

@@ -245,8 +245,8 @@ class Gate:
         self.limits = limits
         self._origins, self._refused, self._measured = origins, refused, measured
         self._share = share or own_share(limits.connections)
-        self._connections: dict[ServerConnection, int] = {}
-        """The connections here, and the number of each on the board."""
+        self._connections: dict[ServerConnection, tuple[int, str]] = {}
+        """The connections here, the number of each on the board, and its `address_of`."""
         self._headers = {
             "Content-Security-Policy": origins.policy,
             "X-Content-Type-Options": "nosniff",
@@ -286,6 +286,11 @@ class Gate:
         """Tell again and again that the event loop runs."""
         self._share.beat()
         self._loop.call_later(BEAT, self._beat)
+
+    def address(self, client: viser.ClientHandle) -> str:
+        """Return the `address_of` a client; empty for this machine's own, and if it has left."""
+        connection = None if self._server is None else patches.connection_of(self._server, client.client_id)
+        return "" if connection is None else self._connections.get(connection, (0, ""))[1]
 
     def idle(self, client: viser.ClientHandle) -> float:
         """Return the time since a client sent something, seconds; 0 if it has left."""
@@ -330,7 +335,7 @@ class Gate:
         address = address_of(connection.remote_address[0], request.headers.get_all("X-Forwarded-For"))
         if address and self._share.num_connections(address) >= self.limits.of_address:
             return CROWDED
-        self._connections[connection] = self._share.connect(address)
+        self._connections[connection] = self._share.connect(address), address
         return None
 
     async def _handle(self, handler: Callable[[ServerConnection], Any], connection: ServerConnection) -> None:
@@ -341,8 +346,8 @@ class Gate:
 
     def leave(self, connection: ServerConnection) -> None:
         """Forget a lost connection."""
-        if (number := self._connections.pop(connection, None)) is not None:
-            self._share.disconnect(number)
+        if (known := self._connections.pop(connection, None)) is not None:
+            self._share.disconnect(known[0])
 
     def passes(self, connection: _Connection, raw: Any) -> bool:  # noqa: ANN401 - bytes, or what no page sends
         """Return whether a message is passed on to viser.

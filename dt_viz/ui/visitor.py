@@ -12,6 +12,7 @@ from functools import partial
 import numpy as np
 import viser
 
+from dt_viz.accounts import Account
 from dt_viz.files.uploads import keep_ready, let_go
 from dt_viz.obstacles.shapes import Sphere, TriangleObstacle, as_point
 from dt_viz.robot.robot import Robot
@@ -67,10 +68,11 @@ class Visitor(Display):
         task: str,
         arms: ArmStore | None = None,
         share: Share | None = None,
+        account: Account | None = None,
     ) -> None:
         """Build the page for an engine of its own and start computing; there is one arm where there are no `arms`.
 
-        Edits and pictures are counted in the `share` of this process, if there is one.
+        Edits and pictures are counted in the `share` of this process, processor time in the visitor's `account`.
         """
         self.client = client
         self.shown: Frame | None = None
@@ -102,7 +104,7 @@ class Visitor(Display):
         begun = self._keeper.begun
         at_once = None if begun is None or _takes_long(begun.scenario) else begun.scenario
         display = self if share is None else Counted(self, share)
-        self.session = Session(engine, initial_scenario, task, display, arms and arms.engine, at_once)
+        self.session = Session(engine, initial_scenario, task, display, arms and arms.engine, at_once, account)
         self._panel.connect(self.session)
         self._keeper.begin(self.session, self._resume)
         if begun is not None and at_once is None:

@@ -3,7 +3,6 @@
 import asyncio
 import functools
 import logging
-import math
 import os
 import socket
 import urllib.error
@@ -36,8 +35,6 @@ from dt_viz.ui.patches import GateError
 from dt_viz.ui.scripts import Ruler, told
 from dt_viz.ui.server import Server
 
-PART = 512 * 1024
-"""Size of a part of an upload, bytes, as in viser's own page."""
 PATIENCE = 90.0
 """Seconds that anything may take: the machine may be busy."""
 UPLOAD = "Mesh or point cloud"
@@ -45,21 +42,7 @@ NUM_PLACES, MAX_WAITING = 2, 8
 
 
 class Client(ProtocolClient):
-    """A visitor who also sends files."""
-
-    async def __aenter__(self):
-        await super().__aenter__()
-        return self
-
-    async def upload(self, name: str, content: bytes, *, announced: int | None = None, transfer: str = "0") -> None:
-        """Send a file with the upload button; its announced size is the true one if None."""
-        size = len(content) if announced is None else announced
-        common = {"source_component_uuid": self.find(UPLOAD), "transfer_uuid": transfer}
-        what = {"filename": name, "mime_type": "", "part_count": math.ceil(size / PART), "size_bytes": size}
-        await self.send("FileTransferStartUpload", **common, **what)
-        for index, begin in enumerate(range(0, len(content), PART)):
-            part = content[begin : begin + PART]
-            await self.send("FileTransferPart", **common, part_index=index, content=part)
+    """A visitor who may be sent away."""
 
     async def is_lost(self) -> bool:
         """Whether the server closes the connection."""
@@ -531,7 +514,7 @@ def uploads_of(visitor):
 @asynchronous
 async def test_what_is_wrong_with_a_file_is_said_and_none_of_it_is_held(url, server, content, announced, said):
     async with visiting(url) as client:
-        await client.upload("x.stl", content, announced=announced)
+        await client.send_file(UPLOAD, "x.stl", content, announced=announced)
         assert await client.wait_for(lambda: client.notices, PATIENCE)
         assert client.notices[0].startswith(said) and len(client.notices) == 1
         assert await answers(client)
@@ -542,7 +525,7 @@ async def test_what_is_wrong_with_a_file_is_said_and_none_of_it_is_held(url, ser
 async def test_a_file_that_is_larger_than_announced_ends_the_connection(url):
     async with visiting(url) as client:
         with pytest.raises(LostError):
-            await client.upload("x.stl", bytes(3 * 2**20), announced=2**20 + 1)
+            await client.send_file(UPLOAD, "x.stl", bytes(3 * 2**20), announced=2**20 + 1)
             assert await client.is_lost()
             await client.look()
 
@@ -551,7 +534,7 @@ async def test_a_file_that_is_larger_than_announced_ends_the_connection(url):
 async def test_files_that_were_given_up_are_not_held(url, server):
     async with visiting(url) as client:
         for k in range(10):
-            await client.upload("x.stl", bytes(2**20), announced=2**21, transfer=f"{k}")
+            await client.send_file(UPLOAD, "x.stl", bytes(2**20), announced=2**21, transfer=f"{k}")
         old = {"source_component_uuid": client.find(UPLOAD), "transfer_uuid": "0"}
         await client.send("FileTransferPart", **old, part_index=3, content=b"x")
         assert await answers(client)
