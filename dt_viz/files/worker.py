@@ -4,8 +4,8 @@ It imports what it needs, gives an empty line, and waits for lines, until its st
 the file `request` of its temporary folder read: a line of JSON, what the files are, the name and size of each, and
 options, and then the files. The file `answer` is a line of JSON, `{"value": …, "arrays": [names]}` as
 `dt_viz.files.values.packed` makes it, or `{"refused": [field, found, accepted]}`, and then the arrays as `numpy.save`
-writes them. Then it gives a line: 0 or the code with which the reader has ended, and the processor time of all so far, seconds.
-Where processes cannot be forked, it reads itself.
+writes them. Then it gives a line: 0 or the code with which the reader has ended, and the seconds of
+processor time of all readers so far. Where processes cannot be forked, it reads itself.
 """
 
 from __future__ import annotations

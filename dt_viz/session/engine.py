@@ -118,17 +118,16 @@ class Engine:
             ImitationError: nothing can be learned from them.
             UnwantedError: it is cancelled.
         """
-        given = progress
 
-        def progress(fraction: float, message: str) -> None:
+        def learn(fraction: float, message: str) -> None:
             _cores.give_way()
-            if given is not None:
-                given(fraction, message)
+            if progress is not None:
+                progress(fraction, message)
 
-        self.nominal(scenario, progress)
+        self.nominal(scenario, learn)
         shown = [panel.shown for panel in scenario.view.panels if panel.shown]
         others = {panel: Scenario(panel.task, state=panel.state, arm=scenario.arm) for panel in shown}
-        learned = {panel: self.nominal(other, progress).learned for panel, other in others.items()}
+        learned = {panel: self.nominal(other, learn).learned for panel, other in others.items()}
         with _cores.slot():
             frame = self._rollouts(scenario, LIVE)
         yield frame
