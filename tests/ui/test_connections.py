@@ -227,6 +227,23 @@ async def test_no_address_takes_all_of_them(url, server, monkeypatch):
 
 
 @asynchronous
+async def test_visitors_of_one_address_owe_what_any_of_them_uses(url, server):
+    async with AsyncExitStack() as stack:
+        for _ in range(NUM_PLACES):
+            client, headers = Client(url), {"X-Forwarded-For": "203.0.113.7"}
+            client._connect = functools.partial(client._connect, additional_headers=headers)
+            await (await stack.enter_async_context(client)).look()
+        await come_true(lambda: len(server.visitors) == NUM_PLACES)
+        one, other = (visitor.session.jobs._account for visitor in server.visitors)
+        one.charge(1000.0)
+        assert one.debt > other.debt > 1
+    await come_true(lambda: not server.visitors)
+    async with visiting(url):
+        (visitor,) = server.visitors
+        assert not visitor.session.jobs._account.debt
+
+
+@asynchronous
 async def test_who_waits_is_told_so_and_has_the_next_place_that_is_free(url, server):
     def says(client, text):
         return any(text in str(control) for control in client.controls.values())
