@@ -18,7 +18,6 @@ from dt_viz.flows.diffeomorphisms import Diffeomorphism
 from dt_viz.flows.fields import Array, CompiledField
 from dt_viz.kernels import escape
 from dt_viz.kernels.dormand_prince import RATE
-from dt_viz.kernels.joint_limits import stretched
 from dt_viz.obstacles.shapes import Obstacle, records
 from dt_viz.robot.body_points import BodyPoints
 from dt_viz.robot.kinematics import cross
@@ -199,8 +198,10 @@ class JointLimits(Diffeomorphism):
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         part = self.fraction if inverse else -self.fraction
-        mapped, factor = stretched(np.array(s, order="C"), self.lower, self.upper, self.zone, part)
-        return mapped, None if U is None else (factor**3)[..., None] * U
+        border = np.minimum(np.maximum(s, self.lower + self.zone), self.upper - self.zone)  # of the zone; else s itself
+        depth = s - border
+        factor = 1 / np.sqrt(1 + part * (depth / self.zone) ** 2)
+        return border + factor * depth, None if U is None else (factor**3)[..., None] * U
 
 
 def _outward(obstacle: Obstacle, points: Array) -> Array:

@@ -23,20 +23,12 @@ Lack = Callable[[Array, float], Array]
 
 
 def clearing_duration(field: VectorField, points: Array, lack: Lack, step: float, longest: float) -> float | None:
-    """Find the shortest duration after which the reverse flow has carried all points clear.
+    """Find the shortest duration after which the reverse flow of a field has carried all points (N, d) clear.
 
-    γ is a one-parameter group, so one integration with snapshots passes every duration on its way; points that are
-    clear stay clear and are dropped. Between the last two snapshots the duration is interpolated.
+    γ is a one-parameter group, so one integration with snapshots, at each `step` of RK4, passes every duration on its
+    way; points that are clear stay clear and are dropped. Between the last two snapshots the duration is interpolated.
 
-    Args:
-        field: generator of the flow.
-        points: (N, d) before the flow.
-        lack: what points lack to be clear.
-        step: flow time between two snapshots, one step of RK4.
-        longest: flow time.
-
-    Returns:
-        The duration, or None where some point is not clear after the longest.
+    Returns None where some point is not clear after the longest one.
     """
     duration, before = 0.0, points
     while (lacking := lack(points, ANY) > 0).any():

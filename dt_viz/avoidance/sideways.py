@@ -125,14 +125,10 @@ class Encounter:
         return cls(obstacle, margin, motion.positions[inside], tangents, ends, tuple(others), plane)
 
     def detour(self, previous: Detour | None, settings: DetourSettings) -> Detour:
-        """Choose the side with the least detour, or the previous one while that costs little more.
+        """Choose the side with the least detour, or the previous one, carried over, while that costs little more.
 
         Where turning there at a limited rate would move the motions farther than going there at once, it is there at
         once: what has just come near may make the detours in between long.
-
-        Args:
-            previous: the detour that is carried over from the obstacle's last pose; None where there was none.
-            settings: how it is chosen.
         """
         found = escape_directions(
             self.points.T[None],
