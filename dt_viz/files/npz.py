@@ -17,15 +17,10 @@ from dt_viz.errors import FormatError
 
 
 def arrays_of(content: bytes | Path, *, max_bytes: int, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
-    """Read the arrays of an npz archive.
-
-    Args:
-        content: all bytes of the file, or its path.
-        max_bytes: largest number of bytes that it may unpack to, as its directory says.
-        names: names of the arrays to read; None reads all.
+    """Read the arrays of an npz archive, its bytes or its path: some by their names, None reads all.
 
     Raises:
-        FormatError: it unpacks to more.
+        FormatError: it unpacks to more than `max_bytes`, as its directory says.
         Exception: of almost any kind, if it is no archive, damaged, or holds pickled objects.
     """
     file = io.BytesIO(content) if isinstance(content, bytes) else content

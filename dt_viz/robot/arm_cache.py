@@ -6,18 +6,16 @@ import hashlib
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from dt_viz.files.npz import arrays_of, npz_bytes, write_whole
+from dt_viz.flows.fields import Array
 from dt_viz.kernels.arm import BODY_POINT
 from dt_viz.robot.body_points import BodyPoints
 from dt_viz.robot.meshes import LinkMesh, VisualMesh, constant
 from dt_viz.robot.robot import Robot
-
-if TYPE_CHECKING:
-    from dt_viz.flows.fields import Array
 
 logger = logging.getLogger(__name__)
 
@@ -48,12 +46,7 @@ def write(path: Path, robot: Robot) -> None:
 
 
 def read(path: Path, given: Mapping[str, Any]) -> Robot | None:
-    """Read an arm that was stored; None where there is none, or it is damaged.
-
-    Args:
-        path: the file.
-        given: fields of the arm that are not stored: where it comes from, and its names.
-    """
+    """Read an arm that was stored, with `given` fields that are not; None where there is none, or it is damaged."""
     if not path.exists():
         return None
     try:
