@@ -172,16 +172,6 @@ class TestFlows:
     def pace(self, field):
         return 1.0 if isinstance(field, WholeArmField) else 0.05
 
-    def test_they_go_on_from_where_they_were_and_squeeze_space(self, field):
-        q, flow = near_ready(12), partial(self.chain, field)
-        in_two = flow(0.2).inverse(flow(0.3).inverse(q))
-        np.testing.assert_allclose(flow(0.5).inverse(q), in_two, rtol=0, atol=1e-7)
-        image, J = flow(0.5).inverse_jacobian(q)
-        assert np.abs(image - q).max() > 0.03
-        np.testing.assert_allclose(flow(0.5).forward(flow(0.5).inverse(q)), q, rtol=0, atol=1e-7)
-        det = np.linalg.det(J)
-        assert det.min() > 0 and np.abs(det - 1).max() > 0.1
-
     def test_the_equal_steps_of_a_drag_come_near_the_adaptive_ones(self, field):
         q, fine = near_ready(12), self.chain(field, 0.4).inverse(near_ready(12))
         coarse = Conjugated(Flow(field, self.pace(field) * 0.4, 2), LIMITS)

@@ -19,15 +19,7 @@ from dt_viz.avoidance.sideways import Sideways
 from dt_viz.avoidance.transform import Transform
 from dt_viz.baselines.eflow import Coupling, Normalisation
 from dt_viz.flows.augmented_systems import OnPlaces, PhaseCurve, PhasedAttractor, Shear, Translation
-from dt_viz.flows.diffeomorphisms import (
-    AdaptiveFlow,
-    Chain,
-    Conjugated,
-    Diffeomorphism,
-    Flow,
-    Identity,
-    Placed,
-)
+from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain, Conjugated, Diffeomorphism, Flow, Identity, Placed
 from dt_viz.flows.fields import GaussianGrid, GridRBF, PlacedField, Projected, Sum, VectorField
 from dt_viz.flows.integrators import EULER, IMPLICIT_EULER
 from dt_viz.flows.systems import Attractor
@@ -252,10 +244,6 @@ class Generator:
     step: float = 1e-3
     exact: float = 1e-8
     """Largest error of its derivative against differences, relative to the largest derivative."""
-
-
-def around_hand(num: int) -> np.ndarray:
-    return np.asarray(HAND.position) + uniform(3, 0.12)(num)
 
 
 def sideways() -> Sideways:

@@ -24,6 +24,7 @@ from dt_viz.learning.store import FitStore
 from dt_viz.motion.stack import LIVE
 from dt_viz.robot import models
 from dt_viz.robot.arm_cache import from_arrays, to_arrays
+from dt_viz.robot.body_points import PROTRUSION
 from dt_viz.robot.choices import ArmSearchSettings, Ranges, find_touching, semantic_homes
 from dt_viz.robot.collision import CollisionModel
 from dt_viz.robot.cover import CoverSettings, cover, protrusion
@@ -39,9 +40,8 @@ from dt_viz.session.engine import Engine
 from dt_viz.session.tasks_in_reach import in_reach
 
 QUICK = ("so100", "xarm7")
-each_arm = pytest.mark.parametrize(
-    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in ARMS if name != "jaco"]
-)
+OTHERS = [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in ARMS if name != "jaco"]
+each_arm = pytest.mark.parametrize("name", OTHERS)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -76,13 +76,15 @@ def beyond(robot: Robot, mesh) -> float:
     return float(away.min(axis=1).max())
 
 
-@each_arm
+@pytest.mark.parametrize("name", ["jaco", *OTHERS])
 def test_spheres_hold_the_links_and_stick_out_by_little(name):
     robot = load_arm(name)
     assert max(beyond(robot, mesh) for mesh in robot.meshes) <= 1e-6
     mean, most = protrusion(robot.body.spheres, robot.meshes)
-    assert mean < 5e-3 and most < 0.03
-    assert f"{1e3 * mean:.1f} mm in the mean" in robot.report()
+    if name == "jaco":
+        assert mean < 3.5e-3 and most < PROTRUSION + 4e-4 and len(robot.body.joint) == 29
+    else:
+        assert mean < 5e-3 and most < 0.03 and f"{1e3 * mean:.1f} mm in the mean" in robot.report()
     wide = robot.body.spheres.copy()
     wide["radius"] += 3e-3
     assert protrusion(wide, robot.meshes)[0] > mean + 2e-3
