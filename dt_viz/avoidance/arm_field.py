@@ -25,8 +25,6 @@ from dt_viz.robot.robot import Robot
 
 DIFFERENCE = 1e-4
 """Step of the finite differences for the slope of an obstacle's distance, metres."""
-POSTURE_DIFFERENCE = 1e-5
-"""Step of those for the derivative of the field, rad."""
 
 LIMIT_ZONE = 0.05
 """Width of the zone before a joint limit in which joints are held back, rad."""
@@ -56,15 +54,6 @@ class ArmField(ABC):
     @abstractmethod
     def __call__(self, q: Array) -> Array:
         """Compute V_q at configurations `q` (N, n), as (N, n)."""
-
-    def with_jacobian(self, q: Array) -> tuple[Array, Array]:
-        """Compute V_q (N, n) and DV_q (N, n, n), by differences of fourth order, at configurations `q` (N, n)."""
-        num, n = q.shape
-        steps = POSTURE_DIFFERENCE * np.array([1, -1, 2, -2])[:, None, None] * np.eye(n)
-        shifted = (q[:, None, None] + steps).reshape(-1, n)
-        near, before, far, behind = np.moveaxis(self(shifted).reshape(num, 4, n, n), 1, 0)
-        slopes = (8 * (near - before) - (far - behind)) / (12 * POSTURE_DIFFERENCE)
-        return self(q), slopes.transpose(0, 2, 1)
 
 
 @dataclass(frozen=True, eq=False)

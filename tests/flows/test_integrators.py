@@ -144,9 +144,6 @@ class Plain:
     def __call__(self, s):
         return self.inner(s)
 
-    def with_jacobian(self, s):
-        raise NotImplementedError
-
 
 @pytest.mark.parametrize("method", [EULER, RK4, DORMAND_PRINCE])
 @pytest.mark.parametrize("duration", [-0.7, 0.5])
