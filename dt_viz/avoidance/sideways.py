@@ -17,14 +17,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dt_viz.avoidance.clearing import escape_lengths
 from dt_viz.avoidance.detour import Detour, DetourSettings, escape_directions
 from dt_viz.avoidance.transform import MotionBelow, SidewaysFlow
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Diffeomorphism
 from dt_viz.flows.fields import Array, Mask, PointField
 from dt_viz.kernels.fields import ASIDE, TERM, Terms
 from dt_viz.obstacles.shapes import Obstacle
-from dt_viz.obstacles.union import Union
+from dt_viz.obstacles.union import Union, escape_lengths
 
 MAX_SAMPLES = 96
 """Largest number of samples that sides are compared by."""
