@@ -279,9 +279,7 @@ FIELDS: dict[str, Generator] = {
     "shift": Generator(Shift(np.array([0.6, 0.0, 0.8]), 3), uniform(3, 0.7), 1e-4, 1e-6),
     "sideways": Generator(sideways(), uniform(3, 0.5)),
     "escape of the hand": Generator(WholeArmField(ROBOT, BODY, (HAND,), UP[None], PINS, REACH), near_ready),
-    "escape of the elbow": Generator(
-        WholeArmField(ROBOT, BODY, (ELBOW,), UP[None], PINS, REACH), near_ready
-    ),
+    "escape of the elbow": Generator(WholeArmField(ROBOT, BODY, (ELBOW,), UP[None], PINS, REACH), near_ready),
     "escape from a small ball": Generator(
         WholeArmField(ROBOT, BODY, (beside_hand(0.01, diameter=0.04),), UP[None], PINS, REACH), near_ready
     ),

@@ -28,6 +28,8 @@ def exported(mesh: trimesh.Trimesh, kind: str) -> bytes:
     content = mesh.export(file_type=kind)
     assert content is not None
     return content.encode() if isinstance(content, str) else bytes(content)  # pyright: ignore[reportArgumentType]
+
+
 MANY = exported(trimesh.Trimesh(BOX.vertices, np.resize(BOX.faces, (MAX_FACES + 1, 3)), process=False), "ply")
 """More triangles than a mesh may have."""
 
