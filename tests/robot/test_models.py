@@ -6,7 +6,6 @@
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 from typing import Literal
 
 import coal  # noqa: TID251, here it is the oracle
@@ -328,50 +327,6 @@ def test_names_that_nobody_knows_are_told(monkeypatch):
     monkeypatch.setitem(sys.modules, "robot_descriptions", None)
     with pytest.raises(ArmError, match=r"found 'nobody'; accepted: jaco, panda, .*pip install robot_descriptions"):
         load_arm("nobody")
-
-
-REPOSITORIES = """
-class Repository:
-    def __init__(self, path): self.cache_path = path
-REPOSITORIES = {name: Repository(name) for name in ("small", "away")}
-"""
-CACHE = """
-import os
-def clone_to_cache(name, commit=None): raise AssertionError("downloaded")
-"""
-DESCRIPTION = """
-from ._cache import clone_to_cache as _clone_to_cache
-REPOSITORY_PATH = _clone_to_cache("NAME", commit=None)
-URDF_PATH = REPOSITORY_PATH + "/arm.urdf"
-"""
-
-
-@pytest.fixture
-def descriptions(tmp_path, monkeypatch):
-    """A package robot_descriptions whose files are not all there, and that would download them."""
-    folder, package = tmp_path / "robot_descriptions", ModuleType("robot_descriptions")
-    package.__path__ = [str(folder)]
-    files = {"_repositories.py": REPOSITORIES, "_cache.py": CACHE, "macro_description.py": "XACRO_PATH = 'x'"}
-    files |= {f"{name}_description.py": DESCRIPTION.replace("NAME", name) for name in ("small", "away")}
-    folder.mkdir()
-    for name, text in files.items():
-        write(folder, text, name)
-    (tmp_path / "files" / "small").mkdir(parents=True)
-    write(tmp_path / "files" / "small", urdf(4, shape=BALL))
-    monkeypatch.setenv("ROBOT_DESCRIPTIONS_CACHE", str(tmp_path / "files"))
-    monkeypatch.setitem(sys.modules, "robot_descriptions", package)
-    yield
-    for name in [name for name in sys.modules if name.startswith("robot_descriptions.")]:
-        del sys.modules[name]
-
-
-def test_arms_of_robot_descriptions_are_loaded_but_never_downloaded(descriptions, tmp_path, monkeypatch):
-    forget(monkeypatch, tmp_path)
-    robot = load_arm("small")
-    assert (robot.name, robot.num_joints) == ("small", 4)
-    for name, words in (("away", "robot_descriptions pull away"), ("macro", "xacro"), ("nothing", "found 'nothing'")):
-        with pytest.raises(ArmError, match=words):
-            load_arm(name)
 
 
 def hollow(sides: int) -> LinkMesh:
