@@ -9,6 +9,8 @@ from dt_viz.kernels.compiled import compiled, short_kernel
 
 NUM_BALL_RINGS = 6
 """Number of rings of a ball."""
+BEND = 0.03
+"""Length of a path that needs as many rings as a turn by one radian, metres."""
 
 
 @compiled
@@ -97,3 +99,23 @@ def tubes(paths: Array, radius: float, ball: float, num_sides: int) -> Array:
         for side in range(num_sides):
             tube[-1, side] = path[-1]
     return vertices
+
+
+@short_kernel
+def evenly_bent(path: Array, num: int) -> Array:
+    """Return (num, 3) points of a path (T, 3), metres: the denser the more it bends."""
+    length, result = len(path), np.empty((num, 3))
+    measure, ahead, before = np.zeros(length), np.zeros(3), np.zeros(3)
+    for place in range(1, length):
+        for k in range(3):
+            ahead[k] = path[place, k] - path[place - 1, k]
+        piece = np.sqrt(dot(ahead, ahead))
+        shorten(ahead)
+        for k in range(3):
+            before[k] -= ahead[k]
+        turn = np.sqrt(dot(before, before)) if place > 1 else 0.0
+        measure[place] = measure[place - 1] + max(piece + BEND * turn, 1e-12)
+        before[:] = ahead
+    for k in range(3):
+        result[:, k] = np.interp(np.linspace(0, measure[-1], num), measure, path[:, k])
+    return result

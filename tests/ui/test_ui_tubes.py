@@ -10,14 +10,14 @@ from pages import frame_of
 from scenes import avoiding
 from scipy.spatial import KDTree
 
-from dt_viz.kernels.tubes import tubes
+from dt_viz.kernels.tubes import evenly_bent, tubes
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui.scene.palette import LIGHT
 from dt_viz.ui.scene.picture import Look
 from dt_viz.ui.scene.rollouts import demonstrations, ghost
 from dt_viz.ui.scene.style import Style
-from dt_viz.ui.scene.tubes import INSIDE, NUM_RINGS, NUM_SIDES, RolloutTubes, Tubes, evenly_bent, tube_faces
+from dt_viz.ui.scene.tubes import INSIDE, NUM_RINGS, NUM_SIDES, RolloutTubes, Tubes, tube_faces
 
 RADIUS, BALL = 0.003, 0.007
 SCENARIO = avoiding("draw_s", (Sphere((0.0, -0.5, 0.4)),))
@@ -28,7 +28,7 @@ def helix(turns, rise=0.3, samples=400):
     return np.stack([0.1 * np.cos(angle), 0.1 * np.sin(angle), rise * np.linspace(0, 1, samples)], axis=1)
 
 
-PATHS = np.stack([evenly_bent(helix(turns)) for turns in (0.2, 1.0, 3.0)])
+PATHS = np.stack([evenly_bent(helix(turns), NUM_RINGS) for turns in (0.2, 1.0, 3.0)])
 
 
 def test_a_tube_lies_around_its_path_with_its_faces_outward():
@@ -65,9 +65,9 @@ def test_a_ball_is_at_the_beginning():
 def test_points_are_denser_where_a_path_bends():
     ends = np.array([[0.0, 0, 0], [0.5, 0, 0], [0.5, 0.5, 0]])
     corner = np.concatenate([np.linspace(a, b, 100) for a, b in pairwise(ends)])
-    spacing = np.linalg.norm(np.diff(evenly_bent(corner), axis=0), axis=1)
+    spacing = np.linalg.norm(np.diff(evenly_bent(corner, NUM_RINGS), axis=0), axis=1)
     assert spacing.min() < 0.6 * spacing.max()
-    np.testing.assert_allclose(evenly_bent(np.zeros((4, 3))), 0)
+    np.testing.assert_allclose(evenly_bent(np.zeros((4, 3)), NUM_RINGS), 0)
 
 
 def test_faces_are_sent_only_when_the_number_of_paths_changes(scene):
@@ -96,7 +96,7 @@ def test_lines_are_drawn_only_beside_the_rollouts(scene):
     half = replace(first, rollouts=(*aside[:3], *task.paths[3:]))
     thin.draw(half, Look(tubes=RolloutTubes(half.rollouts)))
     middles = thin.node.points.mean(axis=1)
-    samples = np.concatenate([evenly_bent(path) for path in half.rollouts])
+    samples = np.concatenate([evenly_bent(path, NUM_RINGS) for path in half.rollouts])
     assert len(middles) > 100 and KDTree(samples).query(middles)[0].min() > 0.99 * INSIDE
     dashed.draw(first, Look(tubes=RolloutTubes(first.rollouts, shown=False)))
     assert len(dashed.node.points) > 10  # nothing covers it any more

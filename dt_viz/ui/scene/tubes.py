@@ -11,8 +11,7 @@ import viser
 from scipy.spatial import KDTree
 
 from dt_viz.flows.fields import Array, Indices
-from dt_viz.kernels.tubes import tubes
-from dt_viz.metrics import interpolate
+from dt_viz.kernels.tubes import evenly_bent, tubes
 from dt_viz.ui.scene.palette import LIGHT, Theme
 from dt_viz.ui.scene.style import Style
 
@@ -68,20 +67,10 @@ def tube_faces(num: int, num_rings: int, num_sides: int) -> Indices:
     return faces.reshape(-1, 3)
 
 
-def evenly_bent(path: Array, num: int = NUM_RINGS) -> Array:
-    """Return (num, 3) points of a path (T, 3), metres: the denser the more it bends."""
-    pieces = np.diff(path, axis=0)
-    length = np.linalg.norm(pieces, axis=1)
-    directions = pieces / np.maximum(length, 1e-12)[:, None]
-    turn = np.linalg.norm(np.diff(directions, axis=0, prepend=directions[:1]), axis=1)
-    # a turn by one radian needs as many rings as 3 cm of the path
-    measure = np.concatenate([[0.0], np.cumsum(np.maximum(length + 0.03 * turn, 1e-12))])
-    return interpolate(np.linspace(0, measure[-1], num), measure, path)
-
-
 def middles_of(paths: Sequence[Array]) -> Array:
     """Return the middles (R, `NUM_RINGS`, 3) of the rings of tubes around paths (T_i, 3), metres."""
-    return np.stack([evenly_bent(path) for path in paths]) if len(paths) else np.zeros((0, NUM_RINGS, 3))
+    middles = [evenly_bent(np.array(path, float, order="C"), NUM_RINGS) for path in paths]
+    return np.stack(middles) if middles else np.zeros((0, NUM_RINGS, 3))
 
 
 @dataclass(frozen=True, eq=False)
