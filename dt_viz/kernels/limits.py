@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from dt_viz.flows.fields import Array, Indices
+from dt_viz.kernels.arm import Array
 from dt_viz.kernels.compiled import compiled, short_kernel
 from dt_viz.kernels.dodging import LimitedArm
+from dt_viz.kernels.proximity import Indices
 
 NUM_ROWS = 8
 """Number of distances, the smallest ones, that have a barrier."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dt_viz.flows.fields import Array
+from dt_viz.kernels.arm import Array
 from dt_viz.kernels.compiled import compiled, short_kernel
 
 NUM_BALL_RINGS = 6
