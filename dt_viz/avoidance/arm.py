@@ -52,12 +52,13 @@ class WholeArm:
 
     def compiled(self) -> Iterator[float]:
         """Compile what a drag repeats for this processor, or load what was compiled before; yields the part done."""
-        robot, q, obstacle = self.robot, self.robot.home[None], Sphere((0.0, 0.0, 0.0))
+        robot, q, obstacle = self.robot, self.robot.home[None].copy(), Sphere((0.0, 0.0, 0.0))
         field = WholeArmField(robot, self.body, (obstacle,), np.eye(3)[:1], q[:0], 0.1)
         points = self.body.of_chain(robot.chain(q.T))
         shapes, values = records((obstacle,))
         joints, links, still = robot.records, robot.links.spheres, np.zeros(robot.num_joints)
-        dodging, ones = LimitedArm(joints, links, still, still, still, 1.0), np.ones((1, 1))
+        limits = robot.lower, robot.upper, robot.velocity_limits
+        dodging, ones = LimitedArm(joints, links, *limits, 1.0), np.ones((1, 1))
         forecast = Forecast(shapes, values, np.ones(1), np.ones((1, 1, 3)), ones, 0.0, 0.0, 1.0)
         calls: tuple[Callable[[], object], ...] = (
             lambda: robot.end_effector(q),
