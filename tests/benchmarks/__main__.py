@@ -12,7 +12,18 @@ from collections.abc import Sequence
 from dt_viz.evaluate.__main__ import run_command
 from tests.benchmarks import sitting
 
-NAMES = ("latency", "drag", "scenes", "exactness", "learning", "pictures", "fairness", "soak", "capacity")
+NAMES = (
+    "latency",
+    "drag",
+    "scenes",
+    "exactness",
+    "learning",
+    "pictures",
+    "fairness",
+    "soak",
+    "capacity",
+    "webassembly",
+)
 PROG = "python -m tests.benchmarks"
 
 
