@@ -8,12 +8,14 @@ msgpack map.
 from __future__ import annotations
 
 import asyncio
+import math
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from importlib.metadata import version
 from types import TracebackType
 from typing import Any
+from uuid import uuid4
 
 import msgspec
 import numpy as np
@@ -31,6 +33,8 @@ STATUS = "Smallest det J"
 """Text in the details of every frame's status."""
 MAX_MESSAGE = 64 * 2**20
 """Largest size of a message from the server, bytes."""
+PART = 512 * 1024
+"""Size of a part of a file, bytes, as in viser's own page."""
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
 
@@ -151,6 +155,26 @@ class ProtocolClient:
     async def set(self, label: str, value: bool | float | str) -> None:
         """Set the value of a control."""
         await self.send("GuiUpdateMessage", uuid=self.find(label), updates={"value": value})
+
+    async def send_file(
+        self, label: str, name: str, content: bytes, *, announced: int | None = None, transfer: str = ""
+    ) -> None:
+        """Send a file with the upload button of this label.
+
+        Args:
+            label: of the button.
+            name: of the file.
+            content: all bytes of it.
+            announced: number of bytes that it is said to have; the true one if None.
+            transfer: identifier of the transfer; a new one if empty.
+        """
+        size = len(content) if announced is None else announced
+        common = {"source_component_uuid": self.find(label), "transfer_uuid": transfer or uuid4().hex}
+        what = {"filename": name, "mime_type": "", "part_count": math.ceil(size / PART), "size_bytes": size}
+        await self.send("FileTransferStartUpload", **common, **what)
+        for index, begin in enumerate(range(0, len(content), PART)):
+            part = content[begin : begin + PART]
+            await self.send("FileTransferPart", **common, part_index=index, content=part)
 
     async def grab(self, name: str = OBSTACLE) -> None:
         """Show the handles of the obstacle, and begin to drag a gizmo."""

@@ -39,6 +39,12 @@ def start_module(
     )
 
 
+def stand_back() -> None:
+    """Let the server, and so its visitors, go before this process where processors are busy."""
+    with suppress(AttributeError, OSError):  # not on Windows
+        os.nice(10)
+
+
 def end_session(process: subprocess.Popen) -> None:
     """End a process with a session of its own, and what it has started, also if it has ended itself before."""
     if hasattr(os, "killpg"):

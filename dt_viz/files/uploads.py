@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from dt_viz.accounts import settle
 from dt_viz.errors import Cancelled, FormatError, end_if, never
 from dt_viz.files import worker
 from dt_viz.files.processes import end_session, start_module
@@ -22,8 +23,8 @@ from dt_viz.files.values import unpacked
 T = TypeVar("T")
 START = 60.0
 """Longest time until a process is ready for a file, seconds; a busy machine takes ten to import what it needs."""
-PATIENCE = 20.0
-"""Longest time for a file from then on, seconds."""
+PATIENCE = 60.0
+"""Longest time for a file from then on, seconds; see `dt_viz.files.worker.limit` for its processor time."""
 
 
 def _ended(code: object) -> FormatError:
@@ -41,7 +42,7 @@ class _Process:
             self._process = start_module(
                 worker.__name__, output=said, given=subprocess.PIPE, temporary=self._temporary.name
             )
-        self._num_lines = 1
+        self._num_lines, self._used = 1, 0.0
         self.is_idle = True
         """Whether it has read everything it was given."""
 
@@ -64,7 +65,9 @@ class _Process:
             self._process.stdin.flush()
         self._num_lines += 1
         found = f"data that take more than {PATIENCE:.0f} s to read"
-        code = self._line(PATIENCE, cancelled, FormatError("file", found, "a simpler file"))
+        code, used = self._line(PATIENCE, cancelled, FormatError("file", found, "a simpler file")).split()
+        settle(float(used) - self._used)
+        self._used = float(used)
         if code != "0":
             raise _ended(code)
         self.is_idle = True
@@ -81,7 +84,7 @@ class _Process:
         return unpacked(first["value"], kind, "file", arrays)
 
     def _line(self, patience: float, cancelled: Cancelled, late: FormatError) -> str:
-        """Wait for the newest line that it has to say: one when it is ready, then a code for each request.
+        """Wait for the newest line that it has to say: one when it is ready, then one for each request.
 
         Raises:
             FormatError: it has ended, or, which `late` says, not said anything for so long.

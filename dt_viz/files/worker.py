@@ -4,8 +4,8 @@ It imports what it needs, gives an empty line, and waits for lines, until its st
 the file `request` of its temporary folder read: a line of JSON, what the files are, the name and size of each, and
 options, and then the files. The file `answer` is a line of JSON, `{"value": …, "arrays": [names]}` as
 `dt_viz.files.values.packed` makes it, or `{"refused": [field, found, accepted]}`, and then the arrays as `numpy.save`
-writes them. Then it gives a line, 0 or the code with which the reader has ended. Where processes cannot be forked, it
-reads itself.
+writes them. Then it gives a line: 0 or the code with which the reader has ended, and the seconds of
+processor time of all readers so far. Where processes cannot be forked, it reads itself.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from dt_viz.errors import FormatError
+from dt_viz.files.processes import stand_back
 from dt_viz.files.recordings import Recordings, read_recordings
 from dt_viz.files.shapes import Points, Triangles, read_points, read_triangles
 from dt_viz.files.values import packed
@@ -108,9 +109,11 @@ def forked(work: Callable[[], None]) -> int:
 
 def main() -> None:
     """Read requests until there are no more."""
+    stand_back()
     print(flush=True)
     while sys.stdin.readline():
-        print(forked(respond), flush=True)
+        code, used = forked(respond), os.times()
+        print(code, used.children_user + used.children_system, flush=True)
 
 
 if __name__ == "__main__":

@@ -7,14 +7,13 @@ that is done and what is going on, and at the end nothing, or the four parts of 
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 import threading
 from contextlib import suppress
 
 from dt_viz.errors import DataError
-from dt_viz.files.processes import start_module
+from dt_viz.files.processes import stand_back, start_module
 from dt_viz.robot.models import NotStoredError, Progress, load_arm
 from dt_viz.robot.robot import Robot
 from dt_viz.robot.urdf import ArmError
@@ -80,8 +79,7 @@ def _make(name: str, progress: Progress) -> None:
 
 def main() -> None:
     """Make the arm of the name on the command line."""
-    with suppress(AttributeError, OSError):  # not on Windows
-        os.nice(10)
+    stand_back()
 
     def tell(*told: object) -> None:
         print(json.dumps(told), flush=True)

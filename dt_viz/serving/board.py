@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import mmap
 import tempfile
+import threading
 import time
 import weakref
 from collections.abc import Iterator
@@ -22,6 +23,18 @@ except ImportError:  # where there are no several processes either
 
 NEVER = np.inf
 """Time of what has not happened."""
+BOUNDS = (0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0)
+"""Upper bounds of the classes of latencies, seconds; a last class holds those above."""
+COUNTS = np.dtype(
+    [
+        ("edits", np.int64),
+        ("latencies", np.int64, len(BOUNDS) + 1),  # number of pictures of rollouts, by the class of their latency
+        ("latency", float),  # sum of these latencies, seconds
+        ("refused", np.int64),
+        ("restarts", np.int64),  # of the process with this row
+    ]
+)
+"""Counts that only grow."""
 
 
 class Board:
@@ -42,6 +55,7 @@ class Board:
                 ("is_prepared", np.int64),
                 ("is_closing", np.int64),
                 ("connections", np.int64, num_connections),  # digest of the address of each connection; 0 for none
+                ("counts", COUNTS),
             ]
         )
         self._memory = mmap.mmap(-1, num_processes * row.itemsize)
@@ -52,8 +66,8 @@ class Board:
             self.clear(number)
 
     def clear(self, number: int) -> None:
-        """Empty the row of a process that has ended, or that begins now."""
-        self.rows[number] = (time.monotonic(), 0, NEVER, 0, 0, 0)
+        """Empty the row of a process that has ended, or that begins now, but for its counts: the next one goes on."""
+        self.rows[number] = (time.monotonic(), 0, NEVER, 0, 0, 0, self.rows[number]["counts"])
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -75,6 +89,7 @@ class Share:
         """Take the row with this number."""
         self._board, self._is_first = board, number == 0
         self._row = board.rows[number : number + 1]
+        self._counting = threading.Lock()
 
     @property
     def num_processes(self) -> int:
@@ -144,6 +159,28 @@ class Share:
     def disconnect(self, number: int) -> None:
         """Count a connection no more."""
         self._row["connections"][0, number] = 0
+
+    @property
+    def counts(self) -> np.void:
+        """Sums of the `COUNTS` of all processes."""
+        counts = self._board.rows["counts"]
+        return np.array([tuple(counts[name].sum(axis=0) for name in counts.dtype.names)], COUNTS)[0]
+
+    def refused(self) -> None:
+        """Count a request that is refused."""
+        with self._counting:
+            self._row["counts"]["refused"] += 1
+
+    def edited(self, num_edits: int) -> None:
+        """Count edits."""
+        with self._counting:
+            self._row["counts"]["edits"] += num_edits
+
+    def answered(self, latency: float) -> None:
+        """Count a picture of rollouts, this long after its edit, seconds."""
+        with self._counting:
+            self._row["counts"]["latencies"][0, np.searchsorted(BOUNDS, latency)] += 1
+            self._row["counts"]["latency"] += latency
 
 
 def _digest(address: str) -> int:

@@ -197,6 +197,7 @@ class Supervisor:
                 if now - worker.started > self._settings.restart:
                     logger.warning("process %d has ended (%d): another one takes its place", worker.process.pid, status)
                     worker.channel.close()
+                    self._board.rows[number]["counts"]["restarts"] += 1
                     self._start(number)
             elif now - self._board.rows[number]["beat"] > self._settings.silence:
                 logger.warning("process %d does not answer: it is ended", worker.process.pid)

@@ -118,10 +118,16 @@ class Engine:
             ImitationError: nothing can be learned from them.
             UnwantedError: it is cancelled.
         """
-        self.nominal(scenario, progress)
+
+        def learn(fraction: float, message: str) -> None:
+            _cores.give_way()
+            if progress is not None:
+                progress(fraction, message)
+
+        self.nominal(scenario, learn)
         shown = [panel.shown for panel in scenario.view.panels if panel.shown]
         others = {panel: Scenario(panel.task, state=panel.state, arm=scenario.arm) for panel in shown}
-        learned = {panel: self.nominal(other, progress).learned for panel, other in others.items()}
+        learned = {panel: self.nominal(other, learn).learned for panel, other in others.items()}
         with _cores.slot():
             frame = self._rollouts(scenario, LIVE)
         yield frame
@@ -320,7 +326,7 @@ class Engine:
         """The last frame again and again, each with more of what is known of other methods."""
         if not frame.scenario.view.compared:
             return
-        left = self.comparison.complete(frame, self._plain(frame.scenario), cancelled)
+        left = self.comparison.complete(frame, self._plain(frame.scenario), _cores.giving_way(cancelled))
         while True:
             with _cores.slot(cancelled):
                 notes = next(left, None)

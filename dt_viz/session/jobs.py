@@ -7,6 +7,7 @@ import threading
 from collections import deque
 from collections.abc import Callable
 
+from dt_viz.accounts import Account, charged
 from dt_viz.errors import UnwantedError
 
 logger = logging.getLogger(__name__)
@@ -21,9 +22,12 @@ class Jobs:
     between its parts and leave out the rest. What was submitted last to a lane is always done.
     """
 
-    def __init__(self, fail: Callable[[Exception], None]) -> None:
-        """Wait for work; `fail` is told of the exceptions that it raises, unless the visitor has left."""
-        self._fail = fail
+    def __init__(self, fail: Callable[[Exception], None], account: Account | None = None) -> None:
+        """Wait for work; `fail` is told of the exceptions that it raises, unless the visitor has left.
+
+        Its processor time is charged to the visitor's `account`, if there is one.
+        """
+        self._fail, self._account = fail, account
         self._changed = threading.Condition()
         self._lanes: dict[str, deque[Work]] = {}
         """Work that waits, of each lane that has a thread."""
@@ -96,7 +100,8 @@ class Jobs:
                     return
                 work = waiting.popleft()
             try:
-                work()
+                with charged(self._account):
+                    work()
             except UnwantedError:
                 pass
             except Exception as error:  # the one place where whatever work raises is caught: the page goes on

@@ -29,6 +29,8 @@ class Pace:
     """Live frames in the last second."""
     num_skipped: int
     """Edits that a newer one overtook, since the session began."""
+    num_edits: int = 0
+    """Edits that were computed or overtaken since then."""
 
 
 @dataclass(frozen=True)
@@ -119,14 +121,15 @@ class Screen:
         """Show a message while a scenario is wanted."""
         self.tell(message=Message(text, severity, wanted))
 
-    def draw(self, frame: Frame, edited: float, num_skipped: int) -> None:
+    def draw(self, frame: Frame, edited: float, num_skipped: int, num_edits: int) -> None:
         """Show a frame whose scenario was asked for at a time, of `time.perf_counter`; learning is no rebuild."""
         now = time.perf_counter()
         latency = now - max(edited, self._learned)
         if frame.stage is Stage.LIVE:
             self._live_frames.append(now)
         rate = sum(now - t <= 1.0 for t in self._live_frames)
-        self._pace = Pace(latency if frame.stage <= Stage.LIVE else self._pace.latency, rate, num_skipped)
+        latency = latency if frame.stage <= Stage.LIVE else self._pace.latency
+        self._pace = Pace(latency, rate, num_skipped, num_edits)
         self._display.draw(frame, self._pace)
         if frame.stage is not Stage.ROLLOUTS:  # the next stage is a few milliseconds away
             with self._telling:

@@ -10,6 +10,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+from dt_viz.accounts import Account
 from dt_viz.avoidance.passing import ANEW
 from dt_viz.errors import DataError, UnwantedError, end_if
 from dt_viz.learning.imitation import ImitationError
@@ -57,6 +58,7 @@ class Session:
         display: Display,
         new_engine: NewEngine | None = None,
         restored: Scenario | None = None,
+        account: Account | None = None,
     ) -> None:
         """Start with a task.
 
@@ -67,6 +69,7 @@ class Session:
             display: where results go.
             new_engine: makes engines for other arms; None if there are none.
             restored: scenario of the first arm to start with instead, if any; see also `restore`.
+            account: charged for processor time; None if nobody counts it.
         """
         self.engines = Engines(engine, new_engine)
         """Engines of this session, by its arms."""
@@ -81,9 +84,9 @@ class Session:
         """Whether the learning of the scenario was cancelled, and there is no other to go back to."""
         self._shown: Frame | None = None
         """The newest frame; None before the first one."""
-        self._num_skipped = 0
-        """Edits that a newer one overtook."""
-        self.jobs = Jobs(self.fail)
+        self._num_skipped = self._num_edits = 0
+        """Edits that a newer one overtook, and all."""
+        self.jobs = Jobs(self.fail, account)
         """All work of the visitor beside the server's event loop."""
         self._adopt()
         self._submit()
@@ -336,6 +339,7 @@ class Session:
         engine = self.engines.get(self.scenario.arm)
         if engine is not None:
             engine.see(self.scenario)
+        self._num_edits += 1
         compute = partial(self._compute, self.scenario, time.perf_counter())
         self._num_skipped += self.jobs.submit(LANE, compute, latest=True)
 
@@ -386,7 +390,7 @@ class Session:
             self._shown = frame
             if frame.stage is Stage.ROLLOUTS and drawn:
                 continue  # it is only looked at in another way: the next stage is what changes
-            self._screen.draw(frame, edited, self._num_skipped)
+            self._screen.draw(frame, edited, self._num_skipped, self._num_edits)
             if frame.stage in (Stage.ROLLOUTS, Stage.FINE):
                 engine.drive(frame)
             if frame.stage is Stage.LIVE:

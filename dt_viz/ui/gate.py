@@ -25,7 +25,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from http import HTTPStatus
-from importlib.metadata import version
 from typing import Any, get_type_hints
 
 import msgspec
@@ -36,6 +35,7 @@ from websockets.http11 import Request, Response
 from dt_viz.errors import DataError, naming
 from dt_viz.files.checks import check_size
 from dt_viz.serving.board import Share, own_share
+from dt_viz.serving.reports import REPORTS, Report
 from dt_viz.ui import patches, scripts
 from dt_viz.ui.origins import Origins, address_of
 
@@ -75,9 +75,6 @@ KINDS: Mapping[str, str] = {
 }
 """Messages that this page uses, by viser's name, and which of the `Limits` of size each has."""
 
-HEALTH = "/health"
-"""Path that tells proxies how the server is."""
-VERSION = version("dt-viz")
 BEAT = 0.25
 """Time after which a process tells again that its event loop runs, seconds."""
 LAST_WORDS = 0.5
@@ -248,8 +245,8 @@ class Gate:
         self.limits = limits
         self._origins, self._refused, self._measured = origins, refused, measured
         self._share = share or own_share(limits.connections)
-        self._connections: dict[ServerConnection, int] = {}
-        """The connections here, and the number of each on the board."""
+        self._connections: dict[ServerConnection, tuple[int, str]] = {}
+        """The connections here, the number of each on the board, and its `address_of`."""
         self._headers = {
             "Content-Security-Policy": origins.policy,
             "X-Content-Type-Options": "nosniff",
@@ -290,6 +287,11 @@ class Gate:
         self._share.beat()
         self._loop.call_later(BEAT, self._beat)
 
+    def address(self, client: viser.ClientHandle) -> str:
+        """Return the `address_of` a client; empty for this machine's own, and if it has left."""
+        connection = None if self._server is None else patches.connection_of(self._server, client.client_id)
+        return "" if connection is None else self._connections.get(connection, (0, ""))[1]
+
     def idle(self, client: viser.ClientHandle) -> float:
         """Return the time since a client sent something, seconds; 0 if it has left."""
         connection = None if self._server is None else patches.connection_of(self._server, client.client_id)
@@ -305,26 +307,18 @@ class Gate:
     def _answer(self, answer: Answer, connection: ServerConnection, request: Request) -> Response | None:
         refusal = self._refusal(connection, request)
         if refusal is not None:
+            self._share.refused()
             logger.warning("a request was refused: %s", refusal[1])
             return connection.respond(*refusal)
         if (told := scripts.told(request.path)) is not None:
             self._measured(*told)
             return connection.respond(HTTPStatus.NO_CONTENT, "")
-        response = self._health(connection) if request.path == HEALTH else answer(connection, request)
+        if (report := REPORTS.get(request.path)) is not None:
+            response = _response(connection, report(self._share, self.limits.places))
+        else:
+            response = answer(connection, request)
         if response is not None:
             response.headers.update(self._headers)
-        return response
-
-    def _health(self, connection: ServerConnection) -> Response:
-        """Answer who asks how the server is, for all its processes; with 503 if nobody else should be sent here."""
-        share, limits = self._share, self.limits
-        state = "closing" if share.is_closing else "full" if share.num_visitors >= limits.places else "ok"
-        known = {"visitors": share.num_visitors, "places": limits.places, "waiting": share.num_waiting}
-        text = msgspec.json.encode({"status": state, **known, "processes": share.num_processes, "version": VERSION})
-        status = HTTPStatus.OK if state == "ok" else HTTPStatus.SERVICE_UNAVAILABLE
-        response = connection.respond(status, text.decode())
-        del response.headers["Content-Type"]
-        response.headers["Content-Type"] = "application/json"
         return response
 
     def _refusal(self, connection: ServerConnection, request: Request) -> Refusal | None:
@@ -341,7 +335,7 @@ class Gate:
         address = address_of(connection.remote_address[0], request.headers.get_all("X-Forwarded-For"))
         if address and self._share.num_connections(address) >= self.limits.of_address:
             return CROWDED
-        self._connections[connection] = self._share.connect(address)
+        self._connections[connection] = self._share.connect(address), address
         return None
 
     async def _handle(self, handler: Callable[[ServerConnection], Any], connection: ServerConnection) -> None:
@@ -352,8 +346,8 @@ class Gate:
 
     def leave(self, connection: ServerConnection) -> None:
         """Forget a lost connection."""
-        if (number := self._connections.pop(connection, None)) is not None:
-            self._share.disconnect(number)
+        if (known := self._connections.pop(connection, None)) is not None:
+            self._share.disconnect(known[0])
 
     def passes(self, connection: _Connection, raw: Any) -> bool:  # noqa: ANN401 - bytes, or what no page sends
         """Return whether a message is passed on to viser.
@@ -407,6 +401,13 @@ def _strict(name: str) -> type[msgspec.Struct]:
         for one in dataclasses.fields(declared)
     ]
     return msgspec.defstruct(name, fields, tag_field="type", tag=name, forbid_unknown_fields=True)
+
+
+def _response(connection: ServerConnection, report: Report) -> Response:
+    response = connection.respond(report.status, report.text)
+    del response.headers["Content-Type"]
+    response.headers["Content-Type"] = report.kind
+    return response
 
 
 async def _closed(connection: ServerConnection) -> None:

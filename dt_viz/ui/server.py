@@ -12,6 +12,7 @@ from typing import NoReturn
 
 import viser
 
+from dt_viz.accounts import Accounts
 from dt_viz.learning.store import FitStore
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.tasks import TaskEntry
@@ -81,9 +82,13 @@ class Server:
             GateError: this version of viser is not supported.
         """
         listening = listening or listen(host, port)
-        titles, arms = {name: entry.title for name, entry in tasks.items()}, ArmStore(tasks, fits, robot)
+        accounts, titles, arms = (
+            Accounts(),
+            {name: entry.title for name, entry in tasks.items()},
+            ArmStore(tasks, fits, robot),
+        )
         self._new_visitor: Callable[[viser.ClientHandle], Visitor] = lambda client: Visitor(
-            client, arms.engine(), robot, titles, task, arms
+            client, arms.engine(), robot, titles, task, arms, self._share, accounts.opened(self.gate.address(client))
         )
         self._max_sessions = max_sessions
         self._lock = threading.Condition()

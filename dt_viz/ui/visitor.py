@@ -12,12 +12,14 @@ from functools import partial
 import numpy as np
 import viser
 
+from dt_viz.accounts import Account
 from dt_viz.files.uploads import keep_ready, let_go
 from dt_viz.obstacles.shapes import Sphere, TriangleObstacle, as_point
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.saved import Known, Saved
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import with_avoidance
+from dt_viz.serving.board import Share
 from dt_viz.session.arms import ArmStore
 from dt_viz.session.comparison import OTHERS
 from dt_viz.session.engine import Engine
@@ -25,6 +27,7 @@ from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.opening import Preview
 from dt_viz.session.progress import Display, Pace, Progress
 from dt_viz.session.session import Session
+from dt_viz.ui.counting import Counted
 from dt_viz.ui.keeping import Keeper
 from dt_viz.ui.panel import ControlPanel
 from dt_viz.ui.playback import Playback
@@ -64,8 +67,13 @@ class Visitor(Display):
         titles: Mapping[str, str],
         task: str,
         arms: ArmStore | None = None,
+        share: Share | None = None,
+        account: Account | None = None,
     ) -> None:
-        """Build the page for an engine of its own and start computing; there is one arm where there are no `arms`."""
+        """Build the page for an engine of its own and start computing; there is one arm where there are no `arms`.
+
+        Edits and pictures are counted in the `share` of this process, processor time in the visitor's `account`.
+        """
         self.client = client
         self.shown: Frame | None = None
         """The last drawn frame."""
@@ -95,7 +103,8 @@ class Visitor(Display):
         )
         begun = self._keeper.begun
         at_once = None if begun is None or _takes_long(begun.scenario) else begun.scenario
-        self.session = Session(engine, initial_scenario, task, self, arms and arms.engine, at_once)
+        display = self if share is None else Counted(self, share)
+        self.session = Session(engine, initial_scenario, task, display, arms and arms.engine, at_once, account)
         self._panel.connect(self.session)
         self._keeper.begin(self.session, self._resume)
         if begun is not None and at_once is None:

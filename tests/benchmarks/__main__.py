@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dt_viz.evaluate.__main__ import run_command
 from tests.benchmarks import sitting
 
-NAMES = ("latency", "drag", "scenes", "exactness", "learning", "pictures", "soak", "capacity")
+NAMES = ("latency", "drag", "scenes", "exactness", "learning", "pictures", "fairness", "soak", "capacity")
 PROG = "python -m tests.benchmarks"
 
 

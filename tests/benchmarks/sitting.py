@@ -57,6 +57,7 @@ SUBJECTS: Mapping[str, Subject] = {
         ("load --visitors 1 4 8 --seconds 20", "load --task push_box --rest --visitors 1 --seconds 40"),
         ".json",
     ),
+    "fairness": Subject("Beside somebody who takes all that he can get", ("fairness",), ".json"),
     "scenes": Subject("Scenes of the paper", ("scenes",), ".json"),
     "exactness": Subject(
         "Exact rollouts",

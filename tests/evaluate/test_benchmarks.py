@@ -1,7 +1,9 @@
 """What developers measure: latency, drags, exactness, off the demonstrations, and most figures in one sitting."""
 
 import argparse
+import asyncio
 import json
+from contextlib import nullcontext
 from dataclasses import replace
 from itertools import pairwise
 
@@ -10,16 +12,19 @@ import pytest
 from hook import NUM_DEMONSTRATIONS
 
 from dt_viz.evaluate.__main__ import main as evaluate
+from dt_viz.evaluate.load import started
+from dt_viz.evaluate.protocol_client import ProtocolClient
 from dt_viz.flows.diffeomorphisms import Identity
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
 from dt_viz.learning.augmented import fit_augmented
 from dt_viz.learning.imitation import fit
 from dt_viz.learning.timing import TimedAttractor
 from dt_viz.metrics import discrete_frechet, distance_from_path
+from dt_viz.obstacles.files import read_mesh
 from dt_viz.scenario.tasks import TASKS, known_tasks
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Stage
-from tests.benchmarks import drag, exactness, latency, sitting
+from tests.benchmarks import drag, exactness, fairness, latency, sitting
 from tests.benchmarks.__main__ import main
 from tests.benchmarks.capacity import Cost, simulated
 from tests.benchmarks.exactness import MAX_DEPARTURE, compare, stepped_adaptively, stepped_beside
@@ -375,3 +380,61 @@ def refuse_to_measure(read, parse):
         return options
 
     return parse_only
+
+
+# --- fairness ---
+
+
+def test_gaps_beside_are_compared_with_those_just_before_and_after(monkeypatch):
+    gaps = iter([[40, 80], [90, 150], [50, 70], [120, 400], [70, 90]])  # alone, beside, alone, …
+    begun = []
+
+    async def gap(*_):
+        await asyncio.sleep(0.01)
+        return np.array(next(gaps), float)
+
+    async def act(other):
+        begun.append(other)
+        other.num_done += 1
+        await asyncio.sleep(60)
+
+    async def arrive(_client):
+        pass
+
+    monkeypatch.setattr(fairness, "ProtocolClient", lambda _url: nullcontext())
+    monkeypatch.setattr(fairness, "_arrive", arrive)
+    monkeypatch.setattr(fairness, "_gap", gap)
+    monkeypatch.setattr(fairness, "OTHER", replace(fairness.OTHER, begun=0.0))
+    monkeypatch.setattr(fairness, "DOINGS", {"acts": act})
+    row = asyncio.run(fairness._compared("", "acts", argparse.Namespace(seconds=1.0, rounds=2)))
+    assert (row["× median"], row["× 95 %"]) == (2.0, pytest.approx((2.0 + 5.0) / 2))
+    assert (row["alone: gap ms, median / 95 %"], row["beside"]) == ("52 / 78", "105 / 275")
+    assert row["done"] == "2" and len(begun) == 2
+
+
+def test_the_torus_is_a_closed_mesh_of_so_many_faces():
+    solid, notes = read_mesh(fairness.torus(20, 30), "torus.stl")
+    assert len(solid.faces) == 1200 and notes == ()
+    np.testing.assert_allclose(np.ptp(solid.vertices, axis=0), [0.16, 0.16, 0.04], rtol=0.02)
+
+
+async def act(url, name, is_done):
+    async with ProtocolClient(url) as client:
+        await client.look()
+        assert await client.wait_for(lambda: client.has_picture, 120)
+        doing = asyncio.create_task(fairness.DOINGS[name](fairness.Other(client)))
+        assert await client.wait_for(lambda: doing.done() or is_done(client), 120)
+        assert not doing.done() or doing.result()
+        doing.cancel()
+
+
+def value(client, label, field):
+    return client.controls[client.find(label)][field]
+
+
+def test_the_other_visitor_does_what_he_is_to_do(monkeypatch):
+    monkeypatch.setattr(fairness, "OTHER", replace(fairness.OTHER, rings=(20, 30)))
+    with started(["--task", "draw_s", "--processes", "1"]) as (url, _):
+        asyncio.run(act(url, "learns", lambda client: value(client, "Task", "value") == "Your data 2"))
+        asyncio.run(act(url, "uploads", lambda client: "2: mesh" in value(client, "Selected", "options")))
+        asyncio.run(act(url, "drags", lambda client: len(value(client, "Selected", "options")) == 5))

@@ -14,6 +14,7 @@ import pytest
 import trimesh
 from pages import PATIENCE, wait_until
 
+from dt_viz.accounts import Account, QuotaSettings, charged
 from dt_viz.errors import FormatError, UnwantedError
 from dt_viz.files import uploads, worker
 from dt_viz.files.shapes import Triangles
@@ -56,6 +57,17 @@ def test_what_is_refused_says_why_in_one_line():
         read_upload(Triangles, [("a.obj", b"v 0 0 0\n")])
     with pytest.raises(FormatError, match="something that cannot be read"):
         read_upload(Triangles, [("a.3mf", b"no archive")])
+
+
+@LINUX
+@pytest.mark.parametrize("ending", ["", "os.abort()"], ids=["read", "ends its reader"])
+def test_the_readers_processor_time_is_charged_to_whoever_sent_the_file(reader, ending):
+    reader(f"while time.process_time() < 0.5: pass\n{ending}")
+    account = Account(None, QuotaSettings(rate=1e-9, saved=0.0))
+    for number in (1, 2):  # by one process, unless that has ended
+        with charged(account), pytest.raises((FormatError, KeyError)):
+            read_upload(Triangles, [("a.stl", BOX)])
+        assert 0.5 * number <= account.debt < 0.5 * number + 0.4
 
 
 @LINUX

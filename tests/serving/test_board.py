@@ -65,6 +65,19 @@ def test_the_row_of_a_process_that_has_ended_counts_no_more(board, shares):
     assert (shares[0].num_visitors, shares[0].num_waiting, shares[0].num_connections()) == (0, 0, 0)
 
 
+def test_counts_only_grow_also_where_a_process_takes_the_place_of_another(board, shares):
+    for share in shares[:2]:
+        share.edited(3)
+        share.answered(0.03)
+    shares[1].refused()
+    board.clear(1)
+    counts = Share(board, 1).counts
+    assert (counts["edits"], counts["refused"], counts["latency"]) == (6, 1, pytest.approx(0.06))
+    assert counts["latencies"].tolist() == [0, 0, 2, *[0] * 7]
+    Share(board, 1).edited(1)
+    assert shares[0].counts["edits"] == 7
+
+
 def test_the_first_process_prepares_then_all_others(shares):
     assert [share.may_prepare for share in shares] == [True, False, False]
     shares[1].prepared()

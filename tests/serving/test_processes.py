@@ -98,6 +98,8 @@ def test_visitors_of_two_processes_share_the_places_and_lose_nothing_else_with_o
         asyncio.run(fill_and_leave(url))
         asyncio.run(until_empty(url))
         asyncio.run(lose_and_return(process, url))
+        with urllib.request.urlopen(f"http{url.removeprefix('ws')}/metrics", timeout=PATIENCE) as response:
+            assert b"\ndt_viz_process_restarts_total 1.0\n" in response.read()
         process.send_signal(signal.SIGTERM)
         _, errors = process.communicate(timeout=PATIENCE)
         assert process.returncode == 0

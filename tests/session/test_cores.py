@@ -1,11 +1,14 @@
 """Slots: no more at once than there are, who follows a hand first, and nobody is left out."""
 
 import threading
+from contextlib import nullcontext
+from time import thread_time
 
 import pytest
 
+from dt_viz.accounts import Account, QuotaSettings, charged
 from dt_viz.errors import UnwantedError, never
-from dt_viz.session.cores import Cores
+from dt_viz.session.cores import Cores, CoresSettings
 
 PATIENCE = 30
 """Seconds after which a test gives up; nothing takes that long."""
@@ -15,16 +18,17 @@ class Crowd:
     """Threads that want slots, and the order in which they get them; each keeps its own until it is let go."""
 
     def __init__(self, num, num_hands=None):
-        self.cores, self.order, self.threads, self.let_go = Cores(num, num_hands or num), [], {}, {}
+        settings = CoresSettings(num_hands=num_hands or num)
+        self.cores, self.order, self.threads, self.let_go = Cores(num, settings), [], {}, {}
         self._got = threading.Condition()
 
-    def come(self, name, cancelled=None):
+    def come(self, name, cancelled=None, account=None):
         """Returns when this one waits or has a slot. Those whose names are upper case refine."""
         cancelled = never if name.isupper() and cancelled is None else cancelled
         self.let_go[name] = threading.Event()
 
         def want():
-            with self.cores.slot(cancelled):
+            with charged(account), self.cores.slot(cancelled):
                 with self._got:
                     self.order.append(name)
                     self._got.notify_all()
@@ -114,6 +118,84 @@ def test_a_refinement_that_is_cancelled_leaves_the_queue_and_takes_nobodys_slot(
     assert crowd.order[-1] == "D left"  # nor does it begin
 
 
+def owing(debt):
+    """An account that is overdrawn by so many seconds, for the time of a test."""
+    account = Account(None, QuotaSettings(rate=1e-9, saved=0.0))
+    account.charge(debt)
+    return account
+
+
+@pytest.mark.parametrize("crowd", [[1]], indirect=True)
+def test_who_has_overdrawn_comes_after_who_has_not_and_who_owes_least_first(crowd):
+    crowd.come("x")
+    crowd.come("b", account=owing(2.0))
+    crowd.come("C", account=owing(1.0))
+    crowd.come("d", account=owing(3.0))
+    crowd.come("E")
+    crowd.come("f", account=Account())
+    crowd.go("x", "f", "E", "C", "b")
+    assert crowd.order == ["x", "f", "E", "C", "b", "d"]
+
+
+@pytest.mark.parametrize("crowd", [[2, 1]], indirect=True)
+def test_who_has_overdrawn_waits_for_nobody_where_nobody_waits_and_lets_a_hand_be_followed_beside_him(crowd):
+    crowd.come("a", account=owing(5.0))
+    assert crowd.order == ["a"]
+    crowd.come("b")
+    assert crowd.order == ["a", "b"]  # he holds no slot of hands
+    crowd.come("c", account=owing(5.0))
+    crowd.go("b")
+    assert crowd.order == ["a", "b"]  # and one is left for them
+    crowd.come("d")
+    crowd.go("a")
+    assert crowd.order == ["a", "b", "d", "c"]
+
+
+def test_what_is_computed_in_a_slot_is_charged(crowd):
+    account = owing(0.0)
+    with charged(account):
+        with crowd.cores.slot():
+            end = thread_time() + 0.1
+            while thread_time() < end:
+                pass
+        assert 0.1 <= account.debt < 0.15
+
+
+@pytest.mark.parametrize("account", [None, owing(5.0)], ids=["in credit", "overdrawn"])
+def test_between_parts_who_has_overdrawn_gives_way_while_a_hand_is_followed(account):
+    cores, went_on = Cores(2, CoresSettings(longest=0.5)), threading.Event()
+
+    def compute():
+        with charged(account), cores.slot(never):
+            assert not cores.giving_way(never)()
+            went_on.set()
+
+    for followed in (True, False):
+        went_on.clear()
+        thread = threading.Thread(target=compute)
+        with cores.slot() if followed else nullcontext():
+            thread.start()
+            assert went_on.wait(0.3) == (account is None or not followed)
+            assert went_on.wait(PATIENCE)  # not for ever
+        thread.join(PATIENCE)
+
+
+def test_who_has_overdrawn_goes_on_as_soon_as_no_hand_is_followed():
+    cores, went_on = Cores(2, CoresSettings(longest=PATIENCE)), threading.Event()
+
+    def compute():
+        with charged(owing(5.0)):
+            cores.give_way()
+            went_on.set()
+
+    thread = threading.Thread(target=compute)
+    with cores.slot():
+        thread.start()
+        assert not went_on.wait(0.2)
+    assert went_on.wait(PATIENCE / 3)
+    thread.join(PATIENCE)
+
+
 def test_a_slot_ends_with_an_exception(crowd):
     with pytest.raises(ZeroDivisionError), crowd.cores.slot(), crowd.cores.slot(never):
         raise ZeroDivisionError
@@ -125,7 +207,7 @@ def test_a_slot_ends_with_an_exception(crowd):
 @pytest.mark.parametrize("num", [1, 2, 3])
 def test_in_a_storm_no_more_than_the_slots_are_taken_and_all_get_one(num):
     free, free_to_refine = threading.Semaphore(num), threading.Semaphore(max(1, num - 1))
-    cores, crowded = Cores(num, num), []
+    cores, crowded = Cores(num, CoresSettings(num_hands=num)), []
 
     def want(refines):
         for _ in range(100):

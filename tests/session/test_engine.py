@@ -319,6 +319,31 @@ def test_refining_that_is_not_wanted_any_more_does_not_wait_for_its_slot(new_eng
         assert ended.wait(PATIENCE)
 
 
+def test_who_learns_or_compares_gives_way_between_parts(new_engine, initial, monkeypatch):
+    cores, paused, told = Cores(2), [], []
+    monkeypatch.setattr(engine_module, "_cores", cores)
+    monkeypatch.setattr(cores, "give_way", lambda: paused.append(len(told)))
+
+    def compare(_frame, _learned, cancelled):
+        told.append("comparing")
+        assert not cancelled()
+        return iter(())
+
+    engine, scenario, nominal = new_engine(), initial("draw_s"), Engine.nominal
+    monkeypatch.setattr(engine.comparison, "complete", compare)
+
+    def learn(self, scenario, progress=None):
+        for _ in range(2 if progress else 0):
+            progress(0.5, "half")
+        return nominal(self, scenario)
+
+    monkeypatch.setattr(Engine, "nominal", learn)
+    scenario = replace(scenario, view=replace(scenario.view, compared=("linear",)))
+    list(engine.frames(scenario, lambda _fraction, message: told.append(message)))
+    assert told == ["half", "half", "comparing"]
+    assert paused == [0, 1, 3]
+
+
 def random_edit(rng, scenario, initial):
     kind = rng.integers(0, 6)
     if kind == 0:

@@ -2,15 +2,33 @@
 
 import logging
 import threading
+import time
 
 import numpy as np
 import pytest
 
+from dt_viz.accounts import Account, QuotaSettings
 from dt_viz.errors import UnwantedError
 from dt_viz.session.jobs import Jobs
 
 PATIENCE = 30.0  # seconds until a hanging test fails; nothing here takes long
 LANE = "lane"
+
+
+def test_what_all_lanes_use_is_charged_to_the_visitor():
+    account, errors = Account(None, QuotaSettings(rate=1e-9, saved=0.0)), []
+    jobs = Jobs(errors.append, account)
+
+    def compute():
+        end = time.thread_time() + 0.1
+        while time.thread_time() < end:
+            pass
+        raise UnwantedError
+
+    for lane in ("a", "b"):
+        jobs.submit(lane, compute)
+    assert jobs.wait_idle(timeout=PATIENCE) and not errors
+    assert 0.2 <= account.debt < 0.25
 
 
 class Gate:

@@ -3,7 +3,6 @@
 import asyncio
 import functools
 import logging
-import math
 import os
 import socket
 import urllib.error
@@ -36,8 +35,6 @@ from dt_viz.ui.patches import GateError
 from dt_viz.ui.scripts import Ruler, told
 from dt_viz.ui.server import Server
 
-PART = 512 * 1024
-"""Size of a part of an upload, bytes, as in viser's own page."""
 PATIENCE = 90.0
 """Seconds that anything may take: the machine may be busy."""
 UPLOAD = "Mesh or point cloud"
@@ -45,21 +42,7 @@ NUM_PLACES, MAX_WAITING = 2, 8
 
 
 class Client(ProtocolClient):
-    """A visitor who also sends files."""
-
-    async def __aenter__(self):
-        await super().__aenter__()
-        return self
-
-    async def upload(self, name: str, content: bytes, *, announced: int | None = None, transfer: str = "0") -> None:
-        """Send a file with the upload button; its announced size is the true one if None."""
-        size = len(content) if announced is None else announced
-        common = {"source_component_uuid": self.find(UPLOAD), "transfer_uuid": transfer}
-        what = {"filename": name, "mime_type": "", "part_count": math.ceil(size / PART), "size_bytes": size}
-        await self.send("FileTransferStartUpload", **common, **what)
-        for index, begin in enumerate(range(0, len(content), PART)):
-            part = content[begin : begin + PART]
-            await self.send("FileTransferPart", **common, part_index=index, content=part)
+    """A visitor who may be sent away."""
 
     async def is_lost(self) -> bool:
         """Whether the server closes the connection."""
@@ -170,6 +153,39 @@ def test_the_page_is_not_given_out_under_such_a_name_either(url, server):
     assert b"--allow-origin" in refused.value.read()
 
 
+def told_to_prometheus(server, host="127.0.0.1"):
+    """Status of the answer, and its values by their names."""
+    request = urllib.request.Request(f"http://127.0.0.1:{server.port}/metrics", headers={"Host": host})
+    try:
+        with urllib.request.urlopen(request) as answer:
+            lines = [line.rsplit(" ", 1) for line in answer.read().decode().splitlines() if line[0] != "#"]
+            return answer.status, {name: float(value) for name, value in lines}
+    except urllib.error.HTTPError as error:
+        return error.code, {}
+
+
+@asynchronous
+async def test_prometheus_is_told_what_visitors_do_and_nobody_is_under_a_foreign_name(url, server):
+    pytest.importorskip("prometheus_client")
+    assert (await asyncio.to_thread(told_to_prometheus, server, "evil.example"))[0] == 421
+    status, before = await asyncio.to_thread(told_to_prometheus, server)
+    async with visiting(url) as client:
+        await client.grab()
+        for k in range(5):
+            await client.move((0.1, -0.5, 0.345 + 0.01 * k))
+            await asyncio.sleep(0.3)
+        await client.release()
+        assert await answers(client)
+        _, after = await asyncio.to_thread(told_to_prometheus, server)
+    assert await status_of(url, origin="https://evil.example") == 403
+    _, refused = await asyncio.to_thread(told_to_prometheus, server)
+    assert status == 200 and before["dt_viz_visitors"] == 0 and after["dt_viz_visitors"] == 1
+    grown = {name: after[f"dt_viz_{name}"] - before[f"dt_viz_{name}"] for name in ("edits_total", "frames_total")}
+    assert 6 <= grown["edits_total"] <= 8 and 2 <= grown["frames_total"] <= grown["edits_total"]
+    assert after["dt_viz_latency_seconds_sum"] > before["dt_viz_latency_seconds_sum"]
+    assert refused["dt_viz_refused_requests_total"] == after["dt_viz_refused_requests_total"] + 1
+
+
 @asynchronous
 async def test_a_page_of_another_version_is_told_so_as_viser_does(url, capfd):
     async with connect(url, subprotocols=[Subprotocol("viser-v0.0.1")], proxy=None) as client:
@@ -208,6 +224,23 @@ async def test_no_address_takes_all_of_them(url, server, monkeypatch):
             assert await status_of(url, additional_headers=headers[2]) == 429
         assert await status_of(url, additional_headers={"X-Forwarded-For": "203.0.113.8"}) == 101
         assert await status_of(url) == 101
+
+
+@asynchronous
+async def test_visitors_of_one_address_owe_what_any_of_them_uses(url, server):
+    async with AsyncExitStack() as stack:
+        for _ in range(NUM_PLACES):
+            client, headers = Client(url), {"X-Forwarded-For": "203.0.113.7"}
+            client._connect = functools.partial(client._connect, additional_headers=headers)
+            await (await stack.enter_async_context(client)).look()
+        await come_true(lambda: len(server.visitors) == NUM_PLACES)
+        one, other = (visitor.session.jobs._account for visitor in server.visitors)
+        one.charge(1000.0)
+        assert one.debt > other.debt > 1
+    await come_true(lambda: not server.visitors)
+    async with visiting(url):
+        (visitor,) = server.visitors
+        assert not visitor.session.jobs._account.debt
 
 
 @asynchronous
@@ -498,7 +531,7 @@ def uploads_of(visitor):
 @asynchronous
 async def test_what_is_wrong_with_a_file_is_said_and_none_of_it_is_held(url, server, content, announced, said):
     async with visiting(url) as client:
-        await client.upload("x.stl", content, announced=announced)
+        await client.send_file(UPLOAD, "x.stl", content, announced=announced)
         assert await client.wait_for(lambda: client.notices, PATIENCE)
         assert client.notices[0].startswith(said) and len(client.notices) == 1
         assert await answers(client)
@@ -509,7 +542,7 @@ async def test_what_is_wrong_with_a_file_is_said_and_none_of_it_is_held(url, ser
 async def test_a_file_that_is_larger_than_announced_ends_the_connection(url):
     async with visiting(url) as client:
         with pytest.raises(LostError):
-            await client.upload("x.stl", bytes(3 * 2**20), announced=2**20 + 1)
+            await client.send_file(UPLOAD, "x.stl", bytes(3 * 2**20), announced=2**20 + 1)
             assert await client.is_lost()
             await client.look()
 
@@ -518,7 +551,7 @@ async def test_a_file_that_is_larger_than_announced_ends_the_connection(url):
 async def test_files_that_were_given_up_are_not_held(url, server):
     async with visiting(url) as client:
         for k in range(10):
-            await client.upload("x.stl", bytes(2**20), announced=2**21, transfer=f"{k}")
+            await client.send_file(UPLOAD, "x.stl", bytes(2**20), announced=2**21, transfer=f"{k}")
         old = {"source_component_uuid": client.find(UPLOAD), "transfer_uuid": "0"}
         await client.send("FileTransferPart", **old, part_index=3, content=b"x")
         assert await answers(client)
