@@ -160,9 +160,12 @@ class Session:
             stack, view = as_fresh(self.scenario, fresh), replace(self.scenario.view, slice=None)
             self.step("task", task=name, arm_rollout=0, starts=fresh.starts, stack=stack, view=view)
 
-    def bring(self, task: Task) -> tuple[Task, str | None]:
-        """Take a task of the visitor's own, to be chosen; see `Engine.bring`."""
-        own, gone = self.engine.bring(task, self.scenario.task)
+    def bring(self, task: Task, arm: str | None = None) -> tuple[Task, str | None]:
+        """Take a task of the visitor's own, made for an arm or for the present one, to be chosen; see `Engine.bring`.
+
+        Raises as `choose_arm`.
+        """
+        own, gone = self._engine_of(self.scenario.arm if arm is None else arm).bring(task, self.scenario.task)
         if gone is not None:
             with self._lock:
                 self._history.forget(gone)
@@ -202,20 +205,26 @@ class Session:
         self._begin("restore", scenario, arm=scenario.arm)
         self._screen.tell(restored=scenario)
 
-    def _task_of(self, arm: str, name: str) -> tuple[Engine, Task]:
-        """The engine for an arm, loaded if need be, and its task of that name; see `choose_arm`."""
-
-        def tell(fraction: float, message: str) -> None:
-            end_if(partial(self.jobs.superseded, CHOICES))
-            self._screen.tell(learning=(fraction, f"Loading the arm: {message}"))
-
+    def _engine_of(self, arm: str) -> Engine:
+        """The engine for an arm, loaded if need be; see `choose_arm`."""
         try:
-            engine = self.engines(arm, tell)
+            return self.engines(arm, self._loading)
+        finally:
+            self._screen.tell(learning=None)
+
+    def _task_of(self, arm: str, name: str) -> tuple[Engine, Task]:
+        """The engine for an arm and its task of that name; see `choose_arm`."""
+        engine = self._engine_of(arm)
+        try:
             if arm != self.scenario.arm:
-                tell(1.0, "placing the task in its reach")
+                self._loading(1.0, "placing the task in its reach")
             return engine, engine.task(name)
         finally:
             self._screen.tell(learning=None)
+
+    def _loading(self, fraction: float, message: str) -> None:
+        end_if(partial(self.jobs.superseded, CHOICES))
+        self._screen.tell(learning=(fraction, f"Loading the arm: {message}"))
 
     def reset(self) -> None:
         """Back to how the task or the scene began, and was looked at; the motion's part of it can be undone."""

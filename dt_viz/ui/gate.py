@@ -69,7 +69,7 @@ KINDS: Mapping[str, str] = {
     "SceneNodeDragMessage": "message",
     "ScenePointerMessage": "message",
     "GetRenderResponseMessage": "image",
-    STORED: "message",
+    STORED: "part",
     "FileTransferStartUpload": "message",
     "FileTransferPart": "part",
 }
@@ -108,7 +108,7 @@ class Limits:
     message: int = 64 * 1024
     """Largest size of most messages, bytes."""
     part: int = 2**20
-    """Largest size of a message with a part of a file, bytes; the page sends half of it."""
+    """Largest size of a message with a part of a file, of which the page sends half, or with what was kept, bytes."""
     image: int = 16 * 2**20
     """Largest size of a message with a rendered image, bytes, and so of any."""
 

@@ -32,8 +32,6 @@ def _tab(browser, server):
 
 def test_six_files_chosen_at_once_are_seen_and_learned_by_a_click_and_undo_goes_back(tab):
     page, visitor = tab
-    press(page.get_by_role("button", name="Open your demonstrations"))
-    page.get_by_role("button", name="Choose files, or drop them here").wait_for()
     files = [{"name": f"pour_{k}.csv", "mimeType": "text/csv", "buffer": take()} for k in range(5)]
     files.append({"name": "astray.csv", "mimeType": "text/csv", "buffer": take((-0.1, -0.5, 0.5))})
     wait_until(lambda: page.locator("input[type=file]").first.evaluate("input => input.multiple"), "the script")
@@ -56,7 +54,6 @@ def test_six_files_chosen_at_once_are_seen_and_learned_by_a_click_and_undo_goes_
 
 def test_files_dropped_on_the_page_are_seen_and_cancel_goes_back(tab):
     page, visitor = tab
-    press(page.get_by_role("button", name="Open your demonstrations"))
     wait_until(lambda: page.locator("input[type=file]").first.evaluate("input => input.multiple"), "the script")
     page.evaluate(DROP, [[f"drop_{k}.csv", take().decode()] for k in range(2)])
     page.get_by_text("drop_1").first.wait_for()
