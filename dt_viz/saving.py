@@ -34,13 +34,17 @@ from dt_viz.learning.interface import AnyImitation
 from dt_viz.learning.patterns import AugmentedSettings
 from dt_viz.learning.preparation import ImitationError
 from dt_viz.obstacles.shapes import SHAPES, Obstacle
+from dt_viz.scenario.saved import Known, Saved, decode, encode, is_saved
 from dt_viz.scenario.scenario import Layer
+from dt_viz.scenario.tasks import TASKS
 
 FORMAT = 1
 """Version of the file; raised where files from before cannot be read any more, also by a change of the imitation's
 arrays. A new field that has a default does not need that."""
 MAX_BYTES = 40 * 10**6
 """Largest number of bytes of a file, and of what it unpacks to."""
+KNOWN = Known(tuple(TASKS), arms=None, methods=None)
+"""What scenarios may name."""
 TEXT, LEARNED = "motion", "imitation."
 """Name of the array that holds the text, and prefix of those of the imitation."""
 
@@ -86,17 +90,29 @@ def save_motion(path: str | os.PathLike[str], motion: SavedMotion, imitation: An
     write_whole(path, content)
 
 
-def load_motion(path: str | os.PathLike[str]) -> tuple[SavedMotion, AnyImitation]:
-    """Read a motion from a file.
+def save_scenario(path: str | os.PathLike[str], saved: Saved) -> None:
+    """Write a scenario to a file, as the page does; an existing one is replaced only by a whole one.
 
     Raises:
-        DataError: there is no such file, it cannot be read, or is no motion saved in this format. Nothing else is
-            raised, whatever the file holds.
+        DataError: the page could not open it.
+        OSError: the file cannot be written.
+    """
+    path, content = Path(path), encode(saved).encode()
+    decode(content, KNOWN, str(path))  # what could not be read is refused now
+    write_whole(path, content)
+
+
+def load_motion(path: str | os.PathLike[str]) -> tuple[SavedMotion, AnyImitation] | Saved:
+    """Read a motion from a file, or a scenario that the page has saved.
+
+    Raises:
+        DataError: there is no such file, it cannot be read, or is neither. Nothing else is raised, whatever the file
+            holds.
     """
     path = Path(path)
     with parsing(MotionError, path, "path", "a readable file"):
         content = read_bytes(path, MAX_BYTES)
-    return read_motion(content, path)
+    return decode(content, KNOWN, str(path)) if is_saved(content) else read_motion(content, path)
 
 
 def read_motion(content: bytes, source: str | Path) -> tuple[SavedMotion, AnyImitation]:

@@ -114,9 +114,10 @@ class Known:
     """Names that a scenario may have."""
 
     tasks: Collection[str]
-    arms: Collection[str] = ("",)
-    methods: Collection[str] = ()
-    """Names of methods that ours is compared with."""
+    arms: Collection[str] | None = ("",)
+    """Names of arms; None are any."""
+    methods: Collection[str] | None = ()
+    """Names of methods that ours is compared with; None are any."""
 
 
 @dataclass(frozen=True)
@@ -246,11 +247,11 @@ def _check(saved: Saved, known: Known) -> None:
         raise FormatError("passing", "one", "none: it is decided anew")
     scenes = [scene.name for scene in offered(known.tasks) if scene.task == scenario.task]
     _check_named("task", scenario.task, known.tasks)
-    _check_named("arm", scenario.arm, known.arms)
+    _check_named("arm", scenario.arm, (scenario.arm,) if known.arms is None else known.arms)
     _check_named("scene", scenario.scene, ("", *scenes))
     _check_named("style", scenario.style, ("", *STYLES))
     for name in (*view.compared, view.their_arm):
-        _check_named("compared method", name, ("", *known.methods))
+        _check_named("compared method", name, ("", *((name,) if known.methods is None else known.methods)))
     for panel in view.panels:
         _check_named("task of a panel", panel.task, ("", *known.tasks))
     counts = {

@@ -230,7 +230,7 @@ class Gate:
         origins: Origins,
         limits: Limits,
         refused: Refused,
-        measured: scripts.Measured = lambda _token, _width: None,
+        told: scripts.Told = lambda _token, _what: None,
         share: Share | None = None,
     ) -> None:
         """Prepare the checks.
@@ -239,14 +239,14 @@ class Gate:
             origins: pages that may connect.
             limits: limits of what visitors send.
             refused: called with a visitor and the reason when a file is not accepted.
-            measured: called with what a `Ruler` measures. It must only take note.
+            told: called with what a `Ruler` measures and reads. It must only take note.
             share: what other processes for the same address tell; None if there are none.
 
         Raises:
             GateError: viser's messages differ from the expected ones.
         """
         self.limits = limits
-        self._origins, self._refused, self._measured = origins, refused, measured
+        self._origins, self._refused, self._told = origins, refused, told
         self._share = share or own_share(limits.connections)
         self._connections: dict[ServerConnection, int] = {}
         """The connections here, and the number of each on the board."""
@@ -308,7 +308,7 @@ class Gate:
             logger.warning("a request was refused: %s", refusal[1])
             return connection.respond(*refusal)
         if (told := scripts.told(request.path)) is not None:
-            self._measured(*told)
+            self._told(*told)
             return connection.respond(HTTPStatus.NO_CONTENT, "")
         response = self._health(connection) if request.path == HEALTH else answer(connection, request)
         if response is not None:

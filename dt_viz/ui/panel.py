@@ -12,7 +12,7 @@ import viser
 from dt_viz.avoidance.avoidance import Space
 from dt_viz.robot.placement import is_jaco
 from dt_viz.robot.robot import Robot
-from dt_viz.scenario.paper_scenes import SCENES, PaperScene, offered
+from dt_viz.scenario.paper_scenes import SCENES, PaperScene, found, offered
 from dt_viz.scenario.saved import Saved, check_shapes
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import avoidance_layer, avoiding_with
@@ -25,6 +25,7 @@ from dt_viz.ui.controls import Control
 from dt_viz.ui.scene.camera import CameraController
 from dt_viz.ui.scene.legend import Legend
 from dt_viz.ui.scene.palette import Colour
+from dt_viz.ui.scripts import Link
 from dt_viz.ui.tabs.about import Command, add_about, add_commands, numbered
 from dt_viz.ui.tabs.arm import add_arm, play_or_pause
 from dt_viz.ui.tabs.compare import ComparePanel
@@ -206,6 +207,18 @@ class ControlPanel:
             session.load(self._scenes[title].task, prepared(self._scenes[title]))
         else:
             session.say(f"“{title}” is made for the JACO: choose it in Arm → Model.", Severity.WARNING)
+
+    def follow(self, session: Session, link: Link) -> None:
+        """Begin the scene or the task that a link asks for; where there is none, say so."""
+        scene = found(link.name, self._scenes.values()) if link.kind == "scene" else None
+        names = self._titles if link.kind == "task" else [each.name for each in self._scenes.values()]
+        if scene is not None:
+            self.begin(self._load, session, scene.title)
+        elif link.kind == "task" and link.name in self._titles:
+            self.begin(lambda session, _title: session.choose_task(link.name), session, self._titles[link.name])
+        else:
+            text = f"The link: {link.kind}: found {link.name!r}; accepted: {', '.join(names)}"
+            session.say(text, Severity.WARNING)
 
     def begin(self, begin: Callable[[Session, str], None], session: Session, title: str) -> None:
         """Begin a task, a scene or an arm beside the server's event loop; if that fails, show why and stay."""

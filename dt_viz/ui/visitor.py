@@ -37,7 +37,7 @@ from dt_viz.ui.scene.export import RESOLUTIONS, render_png
 from dt_viz.ui.scene.palette import DARK, LIGHT, Colour, Theme
 from dt_viz.ui.scene.robot_scene import RobotScene
 from dt_viz.ui.scene.scene import ScenePictures
-from dt_viz.ui.scripts import Ruler
+from dt_viz.ui.scripts import Link, Ruler
 from dt_viz.warning import Severity
 
 
@@ -117,9 +117,12 @@ class Visitor(Display):
         """Have the browser measure its window from now on."""
         self.client.gui.add_html(self.ruler.html)
 
-    def measured(self, width: float) -> None:
-        """Take the width of the window, CSS pixels."""
-        self._camera.measured(width)
+    def told(self, what: float | Link) -> None:
+        """Take the width of the window, CSS pixels, or begin what the link of the page asks for."""
+        if isinstance(what, Link):
+            self._panel.follow(self.session, what)
+        else:
+            self._camera.measured(what)
 
     def draw(self, frame: Frame, pace: Pace) -> None:
         beside = tuple(panel.shown for panel in frame.pictures.panels)

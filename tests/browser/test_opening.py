@@ -1,26 +1,10 @@
 """A visitor's own recordings in a real browser: several files are chosen at once, or dropped, seen, and learned."""
 
-import numpy as np
 import pytest
-from browsing import PATIENCE, close_notices, close_page, open_page, press, wait_until
+from browsing import DROP, PATIENCE, close_notices, close_page, open_page, press, take, wait_until
 from chromium import needs_chromium
 
 pytestmark = [pytest.mark.browser, needs_chromium]
-RNG = np.random.default_rng(5)
-DROP = """files => {
-    const transfer = new DataTransfer();
-    for (const [name, text] of files) transfer.items.add(new File([text], name));
-    for (const type of ['dragover', 'drop'])
-        document.body.dispatchEvent(new DragEvent(type, {dataTransfer: transfer, bubbles: true, cancelable: true}));
-}"""
-
-
-def take(goal=(0.2, -0.45, 0.3)):
-    u = np.linspace(0, 1, 150)
-    start = np.array([-0.2, -0.4, 0.2]) + RNG.normal(scale=0.01, size=3)
-    path = start + (3 * u**2 - 2 * u**3)[:, None] * (np.array(goal) - start) + RNG.normal(scale=0.001, size=(150, 3))
-    rows = np.column_stack([3 * u, path])
-    return "\n".join(["timestamp,pos_x,pos_y,pos_z", *(",".join(f"{v:.5f}" for v in row) for row in rows)]).encode()
 
 
 @pytest.fixture(name="tab")

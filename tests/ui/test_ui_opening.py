@@ -257,7 +257,11 @@ def test_after_cancel_the_next_file_is_the_only_one(opened):
 def test_the_folder_goes_again_with_a_first_file_that_cannot_be_read(opened):
     opened.add("a.csv", b"no numbers")
     assert len(opened.told) == 1 and opened.told[0].startswith("a: ")
-    assert not opened.page.visitor._panel.bindings.session.jobs.busy(LANE) and "Learn" not in opened.labels()
+    containers = opened.page.gui._container_handle_from_uuid.values()
+    (folder,) = (each for each in containers if getattr(each, "label", "") == "Your data")
+    assert not folder.visible
+    opened.add("b.csv", csv())
+    assert folder.visible and opened.num_drawn == 1
 
 
 def test_another_task_ends_what_is_open(opened):
