@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import os
+import zipfile
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ import numpy as np
 from dt_viz.avoidance import registry
 from dt_viz.avoidance.avoidance import SPACES, Avoidance
 from dt_viz.avoidance.transform import Transform
-from dt_viz.errors import DataError, FormatError, check_between, parsing
+from dt_viz.errors import DataError, FormatError, check_between, naming, parsing
 from dt_viz.files.checks import read_bytes
 from dt_viz.files.npz import arrays_of, npz_bytes, write_whole
 from dt_viz.files.values import CLASS, packed, unpacked
@@ -34,9 +35,11 @@ from dt_viz.learning.interface import AnyImitation
 from dt_viz.learning.patterns import AugmentedSettings
 from dt_viz.learning.preparation import ImitationError
 from dt_viz.obstacles.shapes import SHAPES, Obstacle
-from dt_viz.scenario.saved import Known, Saved, decode, encode, is_saved
-from dt_viz.scenario.scenario import Layer
-from dt_viz.scenario.tasks import TASKS
+from dt_viz.scenario.own import Own
+from dt_viz.scenario.relocation import in_world
+from dt_viz.scenario.saved import Known, Saved, check_shapes, decode, encode, is_saved
+from dt_viz.scenario.scenario import Layer, Scenario
+from dt_viz.scenario.tasks import OWN, TASKS, Task, own_task
 
 FORMAT = 1
 """Version of the file; raised where files from before cannot be read any more, also by a change of the imitation's
@@ -100,6 +103,33 @@ def save_scenario(path: str | os.PathLike[str], saved: Saved) -> None:
     path, content = Path(path), encode(saved).encode()
     decode(content, KNOWN, str(path))  # what could not be read is refused now
     write_whole(path, content)
+
+
+def is_motion(path: Path) -> bool:
+    """Return whether a file says that it is a saved motion, whether or not it can be read."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return f"{TEXT}.npy" in archive.namelist()
+    except (OSError, zipfile.BadZipFile):
+        return False
+
+
+def motion_task(path: Path) -> Task:
+    """Return a saved motion as a task of the page, with what was learned and its transforms.
+
+    Raises:
+        DataError: it cannot be read, or has what the page has not, such as two avoidances.
+    """
+    with parsing(MotionError, path, "path", "a readable file"):
+        content = read_bytes(path, MAX_BYTES)
+    saved, imitation = read_motion(content, path)
+    given = own_task(saved.demonstrations)
+    task = replace(given, title=path.stem[:40], state=imitation.state, imitation=imitation, layers=saved.layers)
+    with naming(MotionError, path):
+        scenario = Scenario(OWN, in_world(task))
+    decode(encode(Saved(scenario, own=Own.of(task))), KNOWN, str(path))  # what the page could not have is refused now
+    check_shapes(scenario, str(path))
+    return task
 
 
 def load_motion(path: str | os.PathLike[str]) -> tuple[SavedMotion, AnyImitation] | Saved:

@@ -22,8 +22,9 @@ def learned_of(scenario: Scenario, task: Task, fits: FitStore, progress: Progres
     """
     state = task.state if scenario.state == "auto" else scenario.state
     state = state if scenario.imitation else "plain"  # without it there is nothing to remember
-    settings = ImitationSettings(scenario.objective, preparation=task.preparation)
-    imitation = fits.learned(task.demonstrations, settings, state, progress)
+    settings, imitation = ImitationSettings(scenario.objective, preparation=task.preparation), task.imitation
+    if imitation is None or imitation.state != state or scenario.objective != "trajectory":
+        imitation = fits.learned(task.demonstrations, settings, state, progress)
     if imitation.state == "augmented" and scenario.state == "auto" and not imitation.reason:
         imitation = replace(imitation, reason="the plain state misses a demonstration of this task")
     return Learned.of(task, imitation, imitates=scenario.imitation)

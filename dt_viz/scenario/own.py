@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from dt_viz.errors import FormatError, check_between
 from dt_viz.files.checks import check_at_most
+from dt_viz.flows.diffeomorphisms import Flow
+from dt_viz.flows.fields import Array
 from dt_viz.learning.demonstrations import MAX_COORDINATE, Demonstration, check_demonstrations
+from dt_viz.learning.imitation import Imitation
 from dt_viz.learning.inspection import PreparationSettings
+from dt_viz.learning.interface import State
 from dt_viz.scenario.scenario import MAX_DISTANCE
 from dt_viz.scenario.tasks import Move, Task, own_task
 
@@ -17,6 +22,8 @@ MAX_MOVES = 20
 """Largest number of times that a task is placed."""
 MAX_SEEN = 1000
 """Largest number of findings, and of their characters."""
+MAX_LEARNED_STEPS = 1000
+"""Largest number of steps of all flows of what was learned; a fit here has up to some hundred."""
 SCALES = (1e-3, 1e3)
 """Smallest and largest scale of a placement."""
 
@@ -32,16 +39,24 @@ class Own:
     """What was found about the demonstrations and shown before they were learned."""
     moves: tuple[Move, ...] = ()
     """How it was placed in an arm's reach."""
+    state: State = "auto"
+    """State that it is learned in where none is asked for."""
+    learned: Mapping[str, Array] | None = None
+    """What was learned from the demonstrations elsewhere, in the plain state; see `Imitation.to_arrays`."""
 
     @classmethod
     def of(cls, task: Task) -> Own:
         """Return what a task is made from, whose demonstrations somebody has brought."""
-        return cls(task.demonstrations, task.preparation, task.seen, task.moves)
+        learned = task.imitation.to_arrays() if isinstance(task.imitation, Imitation) else None
+        numbers = learned and {name: array for name, array in learned.items() if array.dtype.kind != "U"}
+        return cls(task.demonstrations, task.preparation, task.seen, task.moves, task.state, numbers)
 
     @property
     def task(self) -> Task:
         """The task, without a name."""
-        task = replace(own_task(self.demonstrations), name="", preparation=self.preparation, seen=self.seen)
+        imitation = None if self.learned is None else Imitation.from_arrays(self.learned)
+        own = {"preparation": self.preparation, "seen": self.seen, "state": self.state, "imitation": imitation}
+        task = replace(own_task(self.demonstrations), name="", **own)
         for scale, shift in self.moves:
             task = task.placed(scale, shift)
         return task
@@ -67,6 +82,10 @@ class Own:
             check_between("scale of a move", scale, *SCALES)
             check_between("shift of a move", float(np.abs(shift).max()), 0.0, MAX_DISTANCE)
         own = replace(self, demonstrations=tuple(map(_as_given, self.demonstrations, usable)))
+        if (imitation := own.task.imitation) is not None:
+            check_between("dimension of what was learned", len(imitation.goal), *[usable[0].dimension] * 2)
+            steps = sum(flow.steps for flow in imitation.transform.parts if isinstance(flow, Flow))
+            check_at_most("steps of what was learned", steps, MAX_LEARNED_STEPS)
         check_between("farthest place", max(float(np.abs(path).max()) for path in own.task.paths), 0.0, MAX_COORDINATE)
         return own
 

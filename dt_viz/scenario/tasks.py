@@ -19,6 +19,7 @@ from dt_viz.metrics import resample_by_arc_length
 from dt_viz.numerics import unit
 from dt_viz.obstacles.shapes import Point, as_point
 from dt_viz.scenario.objects import Ball, LiftedBox, Pot, PushedBox, TaskObject
+from dt_viz.scenario.scenario import Layer
 from dt_viz.scenario.slices import Slice
 from dt_viz.shipped import ASSETS
 
@@ -80,6 +81,10 @@ class Task:
     """Scale at which `placed` has put it, and at which what is added to it is made."""
     moves: tuple[Move, ...] = ()
     """How `placed` has put it, one after the other."""
+    imitation: AnyImitation | None = None
+    """What was learned from the demonstrations, in its state; None is learned here."""
+    layers: tuple[Layer, ...] = ()
+    """Transforms that it begins with, in the frame of the demonstrations; without any it is a sphere to avoid."""
 
     def to_world(self, points: Array) -> Array:
         """Transform points (*B, k) of the demonstrations to the world, (*B, 3), metres."""

@@ -36,7 +36,7 @@ const tell = () => fetch('ADDRESS/' + innerWidth, {cache: 'no-store'});
 window.dtVizResized = () => { clearTimeout(window.dtVizTells); window.dtVizTells = setTimeout(tell, 200); };
 addEventListener('resize', window.dtVizResized);
 tell();
-const page = new URL(location.href), kinds = KINDS.filter(kind => page.searchParams.has(kind));
+const page = new window.URL(location.href), kinds = KINDS.filter(kind => page.searchParams.has(kind));
 for (const kind of kinds.slice(0, 1))
   fetch('ADDRESS/' + kind + '/' + encodeURIComponent(page.searchParams.get(kind)), {cache: 'no-store'});
 for (const kind of kinds) page.searchParams.delete(kind);

@@ -17,6 +17,7 @@ from dt_viz.files.uploads import keep_ready, let_go
 from dt_viz.obstacles.shapes import Sphere, TriangleObstacle, as_point
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.own import Own
+from dt_viz.scenario.relocation import in_world
 from dt_viz.scenario.saved import Known, Saved, encode, is_saved
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import with_avoidance
@@ -44,6 +45,8 @@ from dt_viz.warning import Severity
 def initial_scenario(engine: Engine, name: str) -> Scenario:
     """Return the scenario that a task begins with. Raises what `Engine.task` raises."""
     scenario, task = Scenario(name), engine.task(name)
+    if task.layers:
+        return replace(scenario, stack=in_world(task))
     sphere = Sphere(task.obstacle_position, task.size * Sphere.diameter)
     return replace(scenario, stack=with_avoidance(scenario, obstacles=(sphere,)))
 

@@ -59,6 +59,7 @@ def test_own_demonstrations_go_with_their_scenario_from_server_to_server_byte_fo
     after = moving(other)
     assert [path.tobytes() for path in before] == [path.tobytes() for path in after]
     assert saved(there) == text
+    wait_until(lambda: other._keeper._written == text, "the browser to keep it")
 
     known = set(another.visitors)
     there.reload()
