@@ -239,8 +239,8 @@ def _parser() -> argparse.ArgumentParser:
         "files",
         nargs="*",
         metavar="FILE",
-        help="your own demonstrations: text, .npz, .npy, .mat, .json, .parquet, .hdf5, ROS bags, or folders of them; or "
-        "one motion that the library has saved",
+        help="your own demonstrations: text, .npz, .npy, .mat, .json, .parquet, .hdf5, ROS bags, or folders of them; "
+        "or one motion that the library has saved",
     )
     parser.add_argument("--rate", type=float, metavar="HZ", help="samples per second of files without times")
     parser.add_argument("--unit", metavar="UNIT", help="units of the files, such as mm or cm,ms,deg, if not recognised")

@@ -161,11 +161,9 @@ class Session:
             self.step("task", task=name, arm_rollout=0, starts=fresh.starts, stack=stack, view=view)
 
     def bring(self, task: Task, arm: str | None = None) -> tuple[Task, str | None]:
-        """Take a task of the visitor's own, made for an arm or for the present one, to be chosen; see `Engine.bring`.
-
-        Raises as `choose_arm`.
-        """
-        own, gone = self._engine_of(self.scenario.arm if arm is None else arm).bring(task, self.scenario.task)
+        """Take a visitor's own task, of an arm or the present one; see `Engine.bring`. Raises as `choose_arm`."""
+        engine, _ = self._task_of(self.scenario.arm if arm is None else arm, self.scenario.task)
+        own, gone = engine.bring(task, self.scenario.task)
         if gone is not None:
             with self._lock:
                 self._history.forget(gone)
@@ -205,26 +203,20 @@ class Session:
         self._begin("restore", scenario, arm=scenario.arm)
         self._screen.tell(restored=scenario)
 
-    def _engine_of(self, arm: str) -> Engine:
-        """The engine for an arm, loaded if need be; see `choose_arm`."""
-        try:
-            return self.engines(arm, self._loading)
-        finally:
-            self._screen.tell(learning=None)
-
     def _task_of(self, arm: str, name: str) -> tuple[Engine, Task]:
-        """The engine for an arm and its task of that name; see `choose_arm`."""
-        engine = self._engine_of(arm)
+        """The engine for an arm, loaded if need be, and its task of that name; see `choose_arm`."""
+
+        def tell(fraction: float, message: str) -> None:
+            end_if(partial(self.jobs.superseded, CHOICES))
+            self._screen.tell(learning=(fraction, f"Loading the arm: {message}"))
+
         try:
+            engine = self.engines(arm, tell)
             if arm != self.scenario.arm:
-                self._loading(1.0, "placing the task in its reach")
+                tell(1.0, "placing the task in its reach")
             return engine, engine.task(name)
         finally:
             self._screen.tell(learning=None)
-
-    def _loading(self, fraction: float, message: str) -> None:
-        end_if(partial(self.jobs.superseded, CHOICES))
-        self._screen.tell(learning=(fraction, f"Loading the arm: {message}"))
 
     def reset(self) -> None:
         """Back to how the task or the scene began, and was looked at; the motion's part of it can be undone."""
