@@ -84,7 +84,8 @@ class Own:
         own = replace(self, demonstrations=tuple(map(_as_given, self.demonstrations, usable)))
         if (imitation := own.task.imitation) is not None:
             check_between("dimension of what was learned", len(imitation.goal), *[usable[0].dimension] * 2)
-            steps = sum(flow.steps for flow in imitation.transform.parts if isinstance(flow, Flow))
+            parts = imitation.transform.parts if isinstance(imitation, Imitation) else ()
+            steps = sum(flow.steps for flow in parts if isinstance(flow, Flow))
             check_at_most("steps of what was learned", steps, MAX_LEARNED_STEPS)
         check_between("farthest place", max(float(np.abs(path).max()) for path in own.task.paths), 0.0, MAX_COORDINATE)
         return own

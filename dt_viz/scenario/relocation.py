@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,8 @@ from dt_viz.obstacles.shapes import Box, Cylinder, Obstacle, Point, Sphere, as_p
 from dt_viz.scenario.scenario import MAX_DIAMETER, MIN_DIAMETER, Layer, Scenario, Start
 from dt_viz.scenario.tasks import Task
 
+SIZES = ("diameter", "height", "sizes", "scale")
+"""Fields of obstacles that are lengths."""
 DIGITS = 7
 """Decimal places that lengths are rounded to, metres: there and back is the same to the last bit."""
 
@@ -103,13 +105,13 @@ def _in_world(transform: Transform, task: Task) -> Transform:
 
 def _resized(obstacle: Obstacle, scale: float) -> Obstacle:
     """The obstacle, so many times as large."""
-    sizes: dict[str, Any] = {
-        name: scale * value if isinstance(value, float) else tuple(scale * size for size in value)
-        for name in ("diameter", "height", "sizes", "scale")
-        if name in obstacle.__dataclass_fields__ and (value := getattr(obstacle, name)) is not None
-    }
     changed: Any = obstacle
-    return replace(changed, **sizes)
+    sizes = {field.name: getattr(obstacle, field.name) for field in fields(changed) if field.name in SIZES}
+    return replace(changed, **{name: _scaled(size, scale) for name, size in sizes.items()})
+
+
+def _scaled(size: float | tuple[float, ...], scale: float) -> float | tuple[float, ...]:
+    return tuple(scale * side for side in size) if isinstance(size, tuple) else scale * size
 
 
 def relocated(
