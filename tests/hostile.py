@@ -44,7 +44,7 @@ from dt_viz.saving import SavedMotion, save_motion
 from dt_viz.scenario.own import Own
 from dt_viz.scenario.saved import Known, Saved, check_shapes, decode, encode
 from dt_viz.scenario.scenario import Layer, Scenario
-from dt_viz.scenario.tasks import OWN, TASKS
+from dt_viz.scenario.tasks import OWN, TASKS, own_task
 
 PROCESS = Path("/proc/self")
 """What Linux says of this process."""
@@ -280,16 +280,16 @@ def saved_motion() -> bytes:
         return path.read_bytes()
 
 
+@cache
 def saved_scenario() -> bytes:
-    """A scenario with demonstrations, obstacles and transforms of its own, saved."""
+    """A scenario with demonstrations, what was learned of them, obstacles and transforms of its own, saved."""
     s, rng = np.linspace(0, 1, 20), np.random.default_rng(3)
     turns = rng.normal(size=(20, 4))
     turns /= np.linalg.norm(turns, axis=1, keepdims=True)
     arcs = [np.stack([s - 1, (1 + 0.1 * k) * s * (1 - s), 0 * s], axis=1) for k in range(2)]
-    own = Own(
-        tuple(demos.Demonstration(2 * s, arc, f"arc {k}", turns) for k, arc in enumerate(arcs)),
-        moves=((0.5, (0.1, -0.3, 1 / 3)),),
-    )
+    given = tuple(demos.Demonstration(2 * s, arc, f"arc {k}", turns) for k, arc in enumerate(arcs))
+    imitation = fit(given, ImitationSettings(num_layers=2, num_points=12, max_iterations=2))
+    own = replace(Own.of(replace(own_task(given), imitation=imitation)), moves=((0.5, (0.1, -0.3, 1 / 3)),))
     hand, bias = STACK
     assert isinstance(hand, Avoidance)
     stack = (Layer(bias, name="Bias 1"), Layer(replace(hand, integration=Integration()), name="Avoidance"))

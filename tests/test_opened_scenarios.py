@@ -129,7 +129,9 @@ def test_a_saved_motion_in_space_is_the_same_on_the_page_and_goes_on_as_a_scenar
 
 
 def test_a_saved_drawing_is_put_before_the_robot_with_its_obstacles(tmp_path, new_engine):
-    motion = dt.fit([*arcs(2)], state="plain").stack(dt.Avoidance(dt.Box((0.0, -0.3), (0.05, 0.1, 0.08)), margin=0.01))
+    motion = dt.fit([*arcs(2)], state="plain").stack(
+        dt.Avoidance(dt.Box((0.0, -0.3, 0.0), (0.05, 0.1, 0.08)), margin=0.01)
+    )
     _, own, scenario, solved = on_page(motion, tmp_path, new_engine)
     (box,) = scenario.obstacles
     np.testing.assert_allclose(box.position, own.to_world(np.array([0.0, -0.3])))

@@ -214,7 +214,8 @@ def test_demonstrations_and_shapes_from_files_are_read_back_to_the_last_bit(dim)
     before, after = own.task, again.own.task
     for a, b in zip(before.demonstrations, after.demonstrations, strict=True):
         assert (a.name, a.times.tobytes(), a.positions.tobytes()) == (b.name, b.times.tobytes(), b.positions.tobytes())
-        assert np.array_equal(a.orientations, b.orientations) and b.orientations is not None
+        assert a.orientations is not None and b.orientations is not None
+        assert a.orientations.tobytes() == b.orientations.tobytes()
     assert [path.tobytes() for path in before.paths] == [path.tobytes() for path in after.paths]
     assert (after.preparation, after.seen, after.size) == (own.preparation, own.seen, before.size)
     assert (after.camera, after.obstacle_position) == (before.camera, before.obstacle_position)
