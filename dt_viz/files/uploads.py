@@ -173,11 +173,6 @@ def read_upload(
         _ready.renew(process)
 
 
-def make_ready() -> None:
-    """Start the process for a file that is about to come."""
-    _ready.renew()
-
-
 def keep_ready(user: object) -> None:
     """Keep a process ready, from the first file on, since this user may send more."""
     _ready.set_user(user, present=True)

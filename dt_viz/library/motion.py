@@ -31,6 +31,7 @@ from dt_viz.learning.inspection import Inspection
 from dt_viz.learning.patterns import AugmentedSettings
 from dt_viz.learning.preparation import DemonstrationWarning, prepare
 from dt_viz.learning.state import State, learn
+from dt_viz.library.opened import learned_for
 from dt_viz.library.orientations import along
 from dt_viz.library.places import as_place, in_space
 from dt_viz.library.report import many, missed, orientation_line, sampled, summaries
@@ -38,15 +39,18 @@ from dt_viz.library.takes import Demonstrations, check_goals, demonstrations_of
 from dt_viz.motion.certificates import Certificates, DrawnSamples, certified
 from dt_viz.motion.diagnostics import motion_warnings
 from dt_viz.motion.nominal import NUM_SAMPLES, Learned, Nominal
-from dt_viz.motion.solve import Solved, solve
+from dt_viz.motion.solve import Solved, solve, warped
 from dt_viz.motion.stack import FINE, Solution
-from dt_viz.saving import SavedMotion, load_motion, save_motion
+from dt_viz.saving import SavedMotion, load_motion, save_motion, save_scenario
+from dt_viz.scenario.saved import Saved
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.tasks import Task
 from dt_viz.warning import in_metres
 
 NUM_COORDINATES = 3
 """Coordinates of motions in space."""
+ALONE = Scenario("", ())
+"""What was learned, with nothing stacked on it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,19 +72,25 @@ class Motion:
     """A stable motion: what was learned from demonstrations, and the transforms stacked on it. Not to be changed."""
 
     def __init__(
-        self, learned: Learned, layers: tuple[Layer, ...] = (), inspections: tuple[Inspection, ...] = ()
+        self,
+        learned: Learned,
+        scenario: Scenario = ALONE,
+        inspections: tuple[Inspection, ...] = (),
+        opened: Saved | None = None,
     ) -> None:
-        """Wrap what was learned; see `fit`."""
-        self._learned, self._layers = learned, layers
+        """Wrap what was learned, with what is stacked on it, and what was opened, if that was a scenario; see `fit`."""
+        self._learned, self._opened = learned, opened
+        self.scenario = scenario
+        """The choices of a user of the page that lead to this motion."""
         self.inspections = inspections
         """What was found about each demonstration that was given, and what was done about it."""
-        self.dimension = len(learned.imitation.goal)
-        """d: 2 of drawings, 3 of motions in space."""
+        self.dimension = NUM_COORDINATES if learned.task.draws else len(learned.imitation.goal)
+        """d: 2 of drawings, 3 of motions in space, and of drawings that the page has put there."""
 
     def __repr__(self) -> str:
         takes = many(len(self._learned.imitation.starts), "take")
         where = "the plane" if self.dimension == 2 else "space"
-        layers = "".join(f", {layer.name}" for layer in self._layers)
+        layers = "".join(f", {layer.name}" for layer in self.scenario.stack)
         goal = in_metres(self._learned.goal[: self.dimension])
         turns = " with orientation" if self.has_orientation else ""
         return f"Motion({takes} in {where}{turns}, {self.state} state, goal {goal}{layers})"
@@ -105,7 +115,7 @@ class Motion:
     @property
     def transforms(self) -> tuple[Transform, ...]:
         """The transforms on the imitation, from the inside out."""
-        return tuple(layer.transform for layer in self._layers)
+        return tuple(layer.transform for layer in self.scenario.stack)
 
     @property
     def goal(self) -> Array:
@@ -128,7 +138,7 @@ class Motion:
             name = next(name for k in range(1, len(names) + 2) if (name := f"{title} {k}") not in names)
             layer = Layer(in_space(transform, self.dimension), name=name)
             scenario = replace(scenario, stack=(*scenario.stack, layer))
-        return Motion(self._learned, scenario.stack, self.inspections)
+        return Motion(self._learned, scenario, self.inspections, self._opened)
 
     def rollouts(
         self,
@@ -247,49 +257,55 @@ class Motion:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the motion to a file (npz, whatever its suffix): what was learned, the demonstrations and the stack.
 
-        A file that is there is replaced, and stays as it is if something fails.
+        A motion that was opened from a scenario is written as one (JSON). A file that is there is replaced, and stays
+        as it is if something fails.
 
         Raises:
             DataError: a transform is not one of `dt_viz.avoidance.registry.KINDS`, or holds what could not be read.
             OSError: the file cannot be written.
         """
+        if self._opened is not None:
+            save_scenario(path, replace(self._opened, scenario=self.scenario))
+            return
         demonstrations, imitation = self._learned.task.demonstrations, self._learned.imitation
         chosen = self.state == "augmented", imitation.labels, self.reason, imitation.augmented
-        save_motion(path, SavedMotion(demonstrations, self._layers, *chosen, self.inspections), imitation)
+        save_motion(path, SavedMotion(demonstrations, self.scenario.stack, *chosen, self.inspections), imitation)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Motion:
         """Read the motion that `save` wrote: its paths, velocities and certificates are the same to the last bit.
 
+        Or read a scenario that the page has saved, whose task is learned as there: its motion is the page's, from the
+        demonstrations' starts and then the added ones, in the page's frame (`dt.load_arm("jaco", frame="page")`).
+
         An augmented motion is learned again from its demonstrations, so that this holds for one version of DT-Viz.
 
         Raises:
-            DataError: there is no such file, it cannot be read, or is no saved motion. Nothing else is raised,
-                whatever the file holds; nothing is unpickled.
+            DataError: there is no such file, it cannot be read, or is neither. Nothing else is raised, whatever the
+                file holds, but ImitationError for a scenario; nothing is unpickled.
         """
-        saved, imitation = load_motion(path)
+        read = load_motion(path)
+        if isinstance(read, Saved):
+            return cls(learned_for(read, os.fspath(path)), read.scenario, opened=read)
+        saved, imitation = read
         learned = Learned.of(Task(demonstrations=saved.demonstrations), imitation, imitates=True)
-        return cls(learned, saved.layers, saved.inspections)
+        return cls(learned, Scenario("", saved.layers), saved.inspections)
 
     @cached_property
     def solved(self) -> Solved:
         """The motion of the hand, as exactly as it is computed."""
-        return solve(self.scenario, self.nominal, FINE)
+        full, fraction = solve(self.scenario, self.nominal, FINE), self.scenario.warp
+        return full if fraction == 1 else warped(full, self.nominal.warped(fraction), fraction, FINE, None)
 
     @property
     def solution(self) -> Solution:
         """Its stack."""
         return self.solved.stack
 
-    @property
-    def scenario(self) -> Scenario:
-        """The choices of a user of the page that lead to this motion."""
-        return Scenario("", self._layers)
-
-    @property
+    @cached_property
     def nominal(self) -> Nominal:
-        """The motion without what is stacked on it, from the demonstrations' starts."""
-        return self._learned.demonstrated
+        """The motion without what is stacked on it, from the demonstrations' starts, and from those of a scenario."""
+        return self._learned.nominal([self._learned.trajectory(start) for start in self.scenario.starts])
 
     def _states(self, places: Array, label: float | None) -> Array:
         """The states (R, k) in which motions from places (R, d) begin."""

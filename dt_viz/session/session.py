@@ -163,9 +163,10 @@ class Session:
             stack, view = as_fresh(self.scenario, fresh), replace(self.scenario.view, slice=None)
             self.step("task", task=name, arm_rollout=0, starts=fresh.starts, stack=stack, view=view)
 
-    def bring(self, task: Task) -> tuple[Task, str | None]:
-        """Take a task of the visitor's own, to be chosen; see `Engine.bring`."""
-        own, gone = self.engine.bring(task, self.scenario.task)
+    def bring(self, task: Task, arm: str | None = None) -> tuple[Task, str | None]:
+        """Take a visitor's own task, of an arm or the present one; see `Engine.bring`. Raises as `choose_arm`."""
+        engine, _ = self._task_of(self.scenario.arm if arm is None else arm, self.scenario.task)
+        own, gone = engine.bring(task, self.scenario.task)
         if gone is not None:
             with self._lock:
                 self._history.forget(gone)

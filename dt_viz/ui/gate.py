@@ -69,7 +69,7 @@ KINDS: Mapping[str, str] = {
     "SceneNodeDragMessage": "message",
     "ScenePointerMessage": "message",
     "GetRenderResponseMessage": "image",
-    STORED: "message",
+    STORED: "part",
     "FileTransferStartUpload": "message",
     "FileTransferPart": "part",
 }
@@ -105,7 +105,7 @@ class Limits:
     message: int = 64 * 1024
     """Largest size of most messages, bytes."""
     part: int = 2**20
-    """Largest size of a message with a part of a file, bytes; the page sends half of it."""
+    """Largest size of a message with a part of a file, of which the page sends half, or with what was kept, bytes."""
     image: int = 16 * 2**20
     """Largest size of a message with a rendered image, bytes, and so of any."""
 
@@ -227,7 +227,7 @@ class Gate:
         origins: Origins,
         limits: Limits,
         refused: Refused,
-        measured: scripts.Measured = lambda _token, _width: None,
+        told: scripts.Told = lambda _token, _what: None,
         share: Share | None = None,
     ) -> None:
         """Prepare the checks.
@@ -236,14 +236,14 @@ class Gate:
             origins: pages that may connect.
             limits: limits of what visitors send.
             refused: called with a visitor and the reason when a file is not accepted.
-            measured: called with what a `Ruler` measures. It must only take note.
+            told: called with what a `Ruler` measures and reads. It must only take note.
             share: what other processes for the same address tell; None if there are none.
 
         Raises:
             GateError: viser's messages differ from the expected ones.
         """
         self.limits = limits
-        self._origins, self._refused, self._measured = origins, refused, measured
+        self._origins, self._refused, self._told = origins, refused, told
         self._share = share or own_share(limits.connections)
         self._connections: dict[ServerConnection, tuple[int, str]] = {}
         """The connections here, the number of each on the board, and its `address_of`."""
@@ -311,7 +311,7 @@ class Gate:
             logger.warning("a request was refused: %s", refusal[1])
             return connection.respond(*refusal)
         if (told := scripts.told(request.path)) is not None:
-            self._measured(*told)
+            self._told(*told)
             return connection.respond(HTTPStatus.NO_CONTENT, "")
         if (report := REPORTS.get(request.path)) is not None:
             response = _response(connection, report(self._share, self.limits.places))

@@ -14,9 +14,9 @@ from dt_viz.obstacles.shapes import Box, MeshObstacle, Sphere
 from dt_viz.obstacles.solids import Solid
 from dt_viz.obstacles.surfaces import box_surface
 from dt_viz.scenario.paper_scenes import SCENES
-from dt_viz.scenario.saved import Known, Saved, decode, encode
+from dt_viz.scenario.saved import MAX_BYTES, Known, Saved, decode, encode
 from dt_viz.scenario.scenario import Scenario
-from dt_viz.scenario.tasks import TASKS
+from dt_viz.scenario.tasks import TASKS, own_task
 from dt_viz.session.frame import Stage
 from dt_viz.session.session import CHOICES
 from dt_viz.ui import keeping
@@ -205,8 +205,8 @@ def test_a_reset_is_told_after_what_was_edited_before(opened):
 FORGED = {
     "damaged": made()[: len(made()) // 2],
     "forged": made().replace('"warp":1.0', '"warp":7.0'),
-    "another version": made().replace('"version":1', '"version":99'),
-    "too large": made() + " " * 100_000,
+    "another version": made().replace('"version":2', '"version":99'),
+    "too large": made() + " " * MAX_BYTES,
     "of a task that is not here": made().replace("draw_c", "own_data_1"),
     "something else": '{"theme": "dark"}',
 }
@@ -278,9 +278,29 @@ def test_two_pages_of_one_browser_keep_the_last_edit_and_complain_of_nothing(ope
     other.close()
 
 
-def test_what_is_not_kept_is_said_once_and_all_else_is_kept(opened):
+def test_shapes_from_files_are_kept_and_come_back_beside_the_event_loop(opened):
+    browser, box = Browser(), MeshObstacle(PLACE, Solid(*box_surface(np.full(3, 0.05))))
+    page = opened(browser)
+    page.begin(changed(MADE, obstacles=(box, Sphere(PLACE))))
+    settled(page)
+    assert message(page) == "" and kept(browser).scenario.obstacles == (box, Sphere(PLACE))
+    again = opened(Browser(**browser))
+    assert again.session.jobs.wait_idle(CHOICES, PATIENCE)
+    assert again.session.scenario == page.session.scenario
+
+
+def test_a_broken_shape_that_is_kept_is_said_and_the_page_begins_anew(opened):
+    vertices, faces = box_surface(np.full(3, 0.05))
+    text = made(scenario=changed(MADE, obstacles=(MeshObstacle(PLACE, Solid(vertices, faces[:4])),)))
+    page = opened(Browser(**{KEY: text}))
+    assert page.session.jobs.wait_idle(CHOICES, PATIENCE)
+    assert "mesh: found" in message(page) and page.session.scenario.task == "draw_s"
+
+
+def test_what_is_not_kept_is_said_once_and_all_else_is_kept(opened, monkeypatch):
     browser = Browser()
     page = opened(browser)
+    monkeypatch.setattr(keeping, "MAX_KEPT", len(made()) + 200)
     said = []
     page.session.say = lambda text, severity: said.append(text)
     ball, box = Sphere(PLACE), MeshObstacle(PLACE, Solid(*box_surface(np.full(3, 0.05))))
@@ -292,7 +312,31 @@ def test_what_is_not_kept_is_said_once_and_all_else_is_kept(opened):
     assert kept(browser).scenario == replace(changed(MADE, obstacles=(ball,)), warp=0.5)
 
 
-def test_a_task_of_own_demonstrations_leaves_what_was_kept_before(opened):
+def own_page(opened: Any, browser: Browser) -> Page:
+    """A page on which a task of the visitor's own is shown."""
+    page = opened(browser)
+    own, _ = page.session.bring(own_task(TASKS["draw_s"]().demonstrations).placed(0.8, (0.1, 0.0, 1 / 3)))
+    page.visitor._panel._titles[own.name] = own.title
+    page.session.choose_task(own.name)
+    settled(page)
+    return page
+
+
+def test_a_task_of_own_demonstrations_is_kept_with_them_and_comes_back(opened):
+    browser = Browser()
+    page = own_page(opened, browser)
+    again = opened(Browser(**browser))
+    assert again.session.jobs.wait_idle(CHOICES, PATIENCE)
+    settled(again)
+    before, after = page.session.task, again.session.task
+    assert after is not before and again["Task"].value == "Your data" and message(again) == ""
+    assert [np.array_equal(a, b) for a, b in zip(before.paths, after.paths, strict=True)] == [True] * len(after.paths)
+    assert again.session.scenario == page.session.scenario
+    assert kept(again.client.local_storage).own is not None
+
+
+def test_a_task_of_large_demonstrations_leaves_what_was_kept_before(opened, monkeypatch):
+    monkeypatch.setattr(keeping, "MAX_KEPT", 5000)
     browser = Browser(**{KEY: made()})
     page = opened(browser)
     own, _ = page.session.bring(replace(TASKS["draw_s"](), name=""))
