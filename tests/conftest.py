@@ -40,11 +40,7 @@ from dt_viz.session.engine import Engine
 
 # Nothing here is timed, and a failure must come back on the next run.
 settings.register_profile(
-    "dt-viz",
-    deadline=None,
-    suppress_health_check=[HealthCheck.too_slow],
-    derandomize=True,
-    max_examples=25,
+    "dt-viz", deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True, max_examples=25
 )
 settings.load_profile("dt-viz")
 

@@ -1,7 +1,6 @@
 """Measures of paths against slow, plain definitions, known values and the properties they must have."""
 
 from functools import cache
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -46,16 +45,6 @@ def least_over_all_ways(a, b, combine):
         return combine(distance[i, j], min(reached, default=0.0))
 
     return reach(len(a) - 1, len(b) - 1)
-
-
-def densely(path, spacing):
-    """Points of a path, its own among them, and how far apart they are at most."""
-    pieces = [path[:1]]
-    for a, b in pairwise(path):
-        num = max(1, int(np.ceil(np.linalg.norm(b - a) / spacing)))
-        pieces.append(a + (b - a) * np.linspace(0, 1, num + 1)[1:, None])
-    dense = np.concatenate(pieces)
-    return dense, float(np.linalg.norm(np.diff(dense, axis=0), axis=1).max(initial=0.0))
 
 
 def with_middles(path):

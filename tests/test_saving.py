@@ -322,11 +322,7 @@ FORGED = {
     ),
     "a far ball": (setting(*AVOIDANCE, "obstacles", 0, "position", 0, 1e9), {}, "distance of an obstacle: found 1e"),
     "no orientation": (setting(*AVOIDANCE, "obstacles", 1, "wxyz", [0, 0, 0, 0]), {}, "quaternion: found 0"),
-    "no such array": (
-        setting(*AVOIDANCE, "obstacles", 3, "mesh", "faces", "x"),
-        {},
-        "faces: found 'x'; acc",
-    ),
+    "no such array": (setting(*AVOIDANCE, "obstacles", 3, "mesh", "faces", "x"), {}, "faces: found 'x'; acc"),
     "text for an array": (setting(*AVOIDANCE, "obstacles", 3, "mesh", "faces", [1]), {}, "accepted: the name of an"),
     "an array used twice": (
         setting("demonstrations", 1, "times", "motion.demonstrations[0].times"),
@@ -335,16 +331,8 @@ FORGED = {
     ),
     "faces of no vertices": (LEAVE, {f"{MESH}.faces": np.full((4, 3), 9999)}, "mesh.faces: found vertex 9999"),
     "faces of four": (LEAVE, {f"{MESH}.faces": np.zeros((4, 4), int)}, "mesh.mesh: found shapes"),
-    "faces of fractions": (
-        LEAVE,
-        {f"{MESH}.faces": np.zeros((4, 3))},
-        "array of finite int64",
-    ),
-    "infinite vertices": (
-        LEAVE,
-        {f"{MESH}.vertices": np.full((4, 3), np.inf)},
-        "array of finite float64",
-    ),
+    "faces of fractions": (LEAVE, {f"{MESH}.faces": np.zeros((4, 3))}, "array of finite int64"),
+    "infinite vertices": (LEAVE, {f"{MESH}.vertices": np.full((4, 3), np.inf)}, "array of finite float64"),
     "a mesh that is a point": (LEAVE, {f"{MESH}.vertices": np.zeros((162, 3))}, "mesh.size: found 0"),
     "many faces": (LEAVE, {f"{MESH}.faces": np.zeros((600_000, 3), int)}, "at most 500000"),
     "small numbers": (LEAVE, {f"{MESH}.vertices": np.zeros((4, 3), np.float16)}, "values of type float16"),

@@ -256,14 +256,8 @@ def test_motions_in_the_plane_take_places_of_the_plane(drawing):
 @pytest.mark.parametrize(
     ("transform", "words"),
     [
-        (
-            dt.BiasPoint(flat(0.1, 0.2)),
-            r"position of BiasPoint: found \(0.1, 0.2\); accepted: \(x, y, z\), metres",
-        ),
-        (
-            dt.Avoidance(dt.Sphere(flat(0.1, 0.2))),
-            r"position of Sphere: found \(0.1, 0.2\); accepted: \(x, y, z\)",
-        ),
+        (dt.BiasPoint(flat(0.1, 0.2)), r"position of BiasPoint: found \(0.1, 0.2\); accepted: \(x, y, z\), metres"),
+        (dt.Avoidance(dt.Sphere(flat(0.1, 0.2))), r"position of Sphere: found \(0.1, 0.2\); accepted: \(x, y, z\)"),
         (dt.BiasPoint(cast(Any, "abc")), "position of BiasPoint: found 'abc'"),
         (dt.BiasPoint((0.0, np.inf, 0.0)), "found .*inf"),
     ],

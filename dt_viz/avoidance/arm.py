@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.sparse.csgraph import connected_components
 
 from dt_viz.avoidance.arm_field import JointLimits, WholeArmField
@@ -25,15 +25,11 @@ from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.kernels.blocks import room_asked
 from dt_viz.kernels.dodging import Forecast, LimitedArm, dodge
 from dt_viz.kernels.proximity import contacts, least_contacts, proximity
-from dt_viz.kernels.splines import cubics
 from dt_viz.obstacles.shapes import Obstacle, Sphere, records
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.inverse_kinematics import track
 from dt_viz.robot.robot import Robot
 from dt_viz.robot.sizing import sized
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 NUM_COMPARED = 60
 """Colliding samples that escapes are compared by."""
@@ -65,7 +61,6 @@ class WholeArm:
             lambda: robot.end_effector(q),
             lambda: self.clearance(q, obstacle),
             lambda: track(robot, robot.end_effector(q)[:, None], q, reference=q),
-            lambda: cubics(np.arange(4.0)[None], np.zeros((1, 4, robot.num_joints))),
             lambda: room_asked(q, q, np.zeros(1), np.array(robot.levers), SLOPE, 0.0),
             lambda: proximity(joints, links, shapes, values, q[0].copy(), 1.0),
             lambda: contacts(joints, links, np.array([[-1, 0]]), q[0].copy(), 1.0),
@@ -84,13 +79,7 @@ class WholeArm:
         return self._solver(lifted, avoidance, (), spacing).solution()
 
     def avoiding(
-        self,
-        lifted: Lift,
-        avoidance: ArmAvoidance,
-        spacing: float,
-        *,
-        coarse: bool,
-        passing: Passing = ANEW,
+        self, lifted: Lift, avoidance: ArmAvoidance, spacing: float, *, coarse: bool, passing: Passing = ANEW
     ) -> ArmSolution:
         """The motions around the obstacle.
 
@@ -133,12 +122,7 @@ class WholeArm:
         Detours turn towards the sides that are to be taken, and the flow's duration changes, at rates limited by the
         drag. So no motion jumps where the side changes or none clears the obstacle; until a detour has arrived at its
         side, motions may come nearer than the margin. Where it has and does not clear, it turns to the next side.
-
-        Args:
-            lifted: the motions below.
-            avoidance: what is to be avoided.
-            spacing: as in `avoiding`.
-            passing: the detours around the obstacles at their last poses, and the duration of that flow.
+        `passing` has the detours around the obstacles at their last poses, and the duration of that flow.
         """
         known = carried_over(passing.arm, avoidance.avoided.parts)
         failed = not passing.cleared and passing.duration >= MAX_DURATION
@@ -232,18 +216,11 @@ class WholeArm:
 
 
 def _detours(
-    avoidance: ArmAvoidance,
-    sides: Sequence[Sequence[Array]],
-    known: Sequence[Detour | None],
-    attempts: Sequence[int],
+    avoidance: ArmAvoidance, sides: Sequence[Sequence[Array]], known: Sequence[Detour | None], attempts: Sequence[int]
 ) -> tuple[Detour | None, ...]:
-    """Make detours to these of the sides, or turning to them from those that are carried over.
+    """Make detours to sides (3,) of each obstacle, the most promising first, or turning to them from `known` ones.
 
-    Args:
-        avoidance: whose detours they are.
-        sides: (3,) escapes from each obstacle, the most promising first.
-        known: detours that are carried over.
-        attempts: which of the sides of each obstacle is taken; the last one where there are fewer.
+    The `attempts` say which side of each is taken; the last one where there are fewer.
     """
     detours: list[Detour | None] = []
     for part, found, last, attempt in zip(avoidance.avoided.parts, sides, known, attempts, strict=True):

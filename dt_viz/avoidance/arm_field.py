@@ -18,7 +18,6 @@ from dt_viz.flows.diffeomorphisms import Diffeomorphism
 from dt_viz.flows.fields import Array, CompiledField
 from dt_viz.kernels import escape
 from dt_viz.kernels.dormand_prince import RATE
-from dt_viz.kernels.joint_limits import stretched
 from dt_viz.obstacles.shapes import Obstacle, records
 from dt_viz.robot.body_points import BodyPoints
 from dt_viz.robot.kinematics import cross
@@ -26,8 +25,6 @@ from dt_viz.robot.robot import Robot
 
 DIFFERENCE = 1e-4
 """Step of the finite differences for the slope of an obstacle's distance, metres."""
-POSTURE_DIFFERENCE = 1e-5
-"""Step of those for the derivative of the field, rad."""
 
 LIMIT_ZONE = 0.05
 """Width of the zone before a joint limit in which joints are held back, rad."""
@@ -57,15 +54,6 @@ class ArmField(ABC):
     @abstractmethod
     def __call__(self, q: Array) -> Array:
         """Compute V_q at configurations `q` (N, n), as (N, n)."""
-
-    def with_jacobian(self, q: Array) -> tuple[Array, Array]:
-        """Compute V_q (N, n) and DV_q (N, n, n), by differences of fourth order, at configurations `q` (N, n)."""
-        num, n = q.shape
-        steps = POSTURE_DIFFERENCE * np.array([1, -1, 2, -2])[:, None, None] * np.eye(n)
-        shifted = (q[:, None, None] + steps).reshape(-1, n)
-        near, before, far, behind = np.moveaxis(self(shifted).reshape(num, 4, n, n), 1, 0)
-        slopes = (8 * (near - before) - (far - behind)) / (12 * POSTURE_DIFFERENCE)
-        return self(q), slopes.transpose(0, 2, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,8 +187,10 @@ class JointLimits(Diffeomorphism):
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         part = self.fraction if inverse else -self.fraction
-        mapped, factor = stretched(np.array(s, order="C"), self.lower, self.upper, self.zone, part)
-        return mapped, None if U is None else (factor**3)[..., None] * U
+        border = np.minimum(np.maximum(s, self.lower + self.zone), self.upper - self.zone)  # of the zone; else s itself
+        depth = s - border
+        factor = 1 / np.sqrt(1 + part * (depth / self.zone) ** 2)
+        return border + factor * depth, None if U is None else (factor**3)[..., None] * U
 
 
 def _outward(obstacle: Obstacle, points: Array) -> Array:

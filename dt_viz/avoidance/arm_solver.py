@@ -9,11 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from dt_viz.avoidance.arm_field import (
-    GradientField,
-    JointLimits,
-    WholeArmField,
-)
+from dt_viz.avoidance.arm_field import GradientField, JointLimits, WholeArmField
 from dt_viz.avoidance.arm_settings import WholeArmSettings
 from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.avoidance.clearing import Lack, clearing_duration
@@ -244,15 +240,9 @@ class Solver:
 
 
 def clearing(field: VectorField, limits: JointLimits, p: Array, lack: Lack, step: float, longest: float) -> float:
-    """The shortest time after which the reverse flow of a field has carried postures clear, or the longest.
+    """The shortest flow time after which a field's reverse flow has carried postures (N, n) clear, or the longest.
 
-    Args:
-        field: generator of the flow, in the coordinates of the limits.
-        limits: of the joints.
-        p: (N, n) rad.
-        lack: metres by which postures miss the clearance that is asked for.
-        step: flow time between two checks of the clearance.
-        longest: flow time.
+    The field is in the coordinates of the limits; a `step` is the flow time between two checks of what postures lack.
     """
     duration = clearing_duration(field, limits.forward(p), lambda z, most: lack(limits.inverse(z), most), step, longest)
     return longest if duration is None else duration

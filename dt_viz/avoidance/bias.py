@@ -159,10 +159,7 @@ class BiasPoint(Anchored):
     def _passing(self, nearest: Array, tangents: Array, along: Array) -> Array:
         """Find where motions pass beside the target, (R, 3) metres: straight on from where they are nearest to it.
 
-        Args:
-            nearest: (R, 3) where they are nearest, metres.
-            tangents: (R, 3) unit vectors, their directions there.
-            along: (3,) mean of these directions.
+        Their directions there are `tangents` (R, 3), whose mean is `along` (3,).
         """
         speed = tangents @ along
         behind = (np.asarray(self.position) - nearest) @ along

@@ -1,4 +1,4 @@
-"""Until clear: how long a flow takes to carry points out of something, and how far it is along straight lines."""
+"""Until clear: how long a flow takes to carry points out of something."""
 
 from __future__ import annotations
 
@@ -8,12 +8,6 @@ import numpy as np
 
 from dt_viz.flows.diffeomorphisms import Flow
 from dt_viz.flows.fields import Array, VectorField
-from dt_viz.obstacles.shapes import Obstacle
-from dt_viz.obstacles.union import Union
-
-MAX_STEPS, SHORTEST = 100, 1e-4
-"""Largest number of steps along a line, and the smallest one, metres: bounds the overshoot beyond the surface."""
-
 
 ANY = 1e-4
 """Lack beyond which its size does not matter, where it is only asked whether points are clear."""
@@ -23,20 +17,12 @@ Lack = Callable[[Array, float], Array]
 
 
 def clearing_duration(field: VectorField, points: Array, lack: Lack, step: float, longest: float) -> float | None:
-    """Find the shortest duration after which the reverse flow has carried all points clear.
+    """Find the shortest duration after which the reverse flow of a field has carried all points (N, d) clear.
 
-    γ is a one-parameter group, so one integration with snapshots passes every duration on its way; points that are
-    clear stay clear and are dropped. Between the last two snapshots the duration is interpolated.
+    γ is a one-parameter group, so one integration with snapshots, at each `step` of RK4, passes every duration on its
+    way; points that are clear stay clear and are dropped. Between the last two snapshots the duration is interpolated.
 
-    Args:
-        field: generator of the flow.
-        points: (N, d) before the flow.
-        lack: what points lack to be clear.
-        step: flow time between two snapshots, one step of RK4.
-        longest: flow time.
-
-    Returns:
-        The duration, or None where some point is not clear after the longest.
+    Returns None where some point is not clear after the longest one.
     """
     duration, before = 0.0, points
     while (lacking := lack(points, ANY) > 0).any():
@@ -49,14 +35,3 @@ def clearing_duration(field: VectorField, points: Array, lack: Lack, step: float
         return 0.0
     lacked, left = lack(before, np.inf), lack(points, np.inf)
     return duration - step + step * float((lacked / np.maximum(lacked - left, 1e-12)).clip(0, 1).max())
-
-
-def escape_lengths(obstacle: Obstacle | Union, points: Array, directions: Array, margin: float = 0.0) -> Array:
-    """How far points (N, 3) have to go along unit vectors (N, 3), or one for all, to keep a margin: (N,) metres."""
-    length = np.zeros(np.broadcast_shapes(points.shape, directions.shape)[:-1])
-    for _ in range(MAX_STEPS):
-        lacking = margin - obstacle.signed_distance(points + length[:, None] * directions)
-        if lacking.max() <= 0:
-            break
-        length += np.where(lacking > 0, np.maximum(lacking, SHORTEST), 0)
-    return length

@@ -159,12 +159,9 @@ class Detour:
         return self.length * self.direction
 
     def turned_from(self, previous: Detour, escapes: Sequence[Array], turning: float) -> Detour:
-        """Turn from the previous detour towards this one, by an angle for each metre that the obstacle has moved.
+        """Turn from the previous detour, carried over, towards this one: by `turning`, rad, for each radius of travel.
 
-        Args:
-            previous: the detour that is carried over from the obstacle's last pose.
-            escapes: (3,) unit vectors, the best one first; see `turned`.
-            turning: angle, rad, while the obstacle moves by its radius.
+        Of the escapes (3,) the best comes first; see `turned`.
         """
         angle = turning * (previous.travelled or 0.0) / self.obstacle.radius
         direction = turned(previous.direction, self.side, angle, escapes)
@@ -174,12 +171,9 @@ class Detour:
 def carried_over(
     detours: Sequence[Detour | None], obstacles: Sequence[Obstacle], *, turn: bool = True
 ) -> tuple[Detour | None, ...]:
-    """Carry detours over to the obstacles that are dragged, or rest where a drag has ended; None for the others.
+    """Carry detours of the last motion over to the obstacles where they are now; None for those that nobody drags.
 
-    Args:
-        detours: those of the last motion, one for each obstacle, or none.
-        obstacles: the obstacles where they are now.
-        turn: whether motions turn to other sides at a limited rate, as the obstacles move; else they are there at once.
+    Motions turn to other sides at a limited rate, as the obstacles move; without `turn` they are there at once.
     """
     if len(detours) != len(obstacles):
         return (None,) * len(obstacles)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from dt_viz.avoidance.avoidance import Avoidance
-from dt_viz.avoidance.clearing import clearing_duration, escape_lengths
+from dt_viz.avoidance.clearing import clearing_duration
 from dt_viz.avoidance.detour import Detour, DetourSettings, directions_around
 from dt_viz.avoidance.sideways import Encounter, fixing_ends
 from dt_viz.avoidance.start_status import start_warnings
@@ -18,7 +18,7 @@ from dt_viz.avoidance.transform import Built, MotionBelow, Planar, SidewaysFlow,
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain, Diffeomorphism
 from dt_viz.flows.fields import Array, Mask, Projected, VectorField
 from dt_viz.obstacles.shapes import Obstacle, Point
-from dt_viz.obstacles.union import Union
+from dt_viz.obstacles.union import Union, escape_lengths
 from dt_viz.warning import Kind, MotionWarning, in_millimetres
 
 MAX_DURATION = 2.5

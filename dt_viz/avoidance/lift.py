@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 from dt_viz.flows.fields import Array, Indices, Mask
-from dt_viz.kernels.splines import cubics
 from dt_viz.robot.inverse_kinematics import TrackedPath, track
 from dt_viz.robot.robot import Robot
 
@@ -40,8 +40,8 @@ class Lift:
     @cached_property
     def _splines(self) -> tuple[Array, Array]:
         """Fractions (R, T − 1) at which the cubics begin, and their coefficients (4, R·(T − 1), n)."""
-        coefficients = cubics(np.array(self.fractions, order="C"), np.array(self.tracked.q, order="C"))
-        return self.fractions[:, :-1], coefficients.reshape(4, -1, self.tracked.q.shape[-1])
+        coefficients = [CubicSpline(*curve).c for curve in zip(self.fractions, self.tracked.q, strict=True)]
+        return self.fractions[:, :-1], np.concatenate(coefficients, axis=1)
 
     def at(self, index: Indices, fraction: Array) -> Array:
         """Configurations (N, n), rad, of the rollouts `index` (N,) at the fractions `fraction` (N,)."""
@@ -82,16 +82,7 @@ def lift(
     initial: Array | None = None,
     orientations: Array | None = None,
 ) -> Lift:
-    """Follow rollouts with the joints.
-
-    Args:
-        robot: whose joints.
-        fractions: (R, T) where on their base rays the samples are.
-        paths: (R, T, 3) end effector there, metres.
-        reference: (n,) posture that the arm stays near to, rad.
-        initial: (R, T, n) joints of nearby paths to begin from, rad.
-        orientations: (R, T, 4) of the hand there, wxyz; None wants none.
-    """
+    """Follow rollouts with the joints: paths (R, T, 3), metres, at fractions (R, T) of base rays; see `track`."""
     start, every = np.broadcast_to(reference, (len(paths), robot.num_joints)), np.ones(len(paths), bool)
     tracked = track(robot, paths, start, initial, reference=start, orientations=orientations)
     return Lift(fractions, tracked, reference, every, every)

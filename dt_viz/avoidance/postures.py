@@ -68,12 +68,7 @@ class ReferencePostures:
         return np.sqrt((apart**2).sum(axis=2).mean(axis=1)) < WholeArmSettings.of(self.robot).alike
 
     def cost(self, obstacle: Union | Obstacle, asked: float) -> Array:
-        """Costs (K,), metres, of the detour from the usual postures and of what lies in the way on the path.
-
-        Args:
-            obstacle: what may be in the way.
-            asked: clearance that is asked for, metres.
-        """
+        """Costs (K,), metres, of the detour from the usual postures, and of what the path lacks of a clearance."""
         lacking = np.maximum(asked - self._clearance(self.on_path, obstacle, asked), 0)
         return self.away + (self._stuck * lacking).mean(axis=1)
 

@@ -17,14 +17,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dt_viz.avoidance.clearing import escape_lengths
 from dt_viz.avoidance.detour import Detour, DetourSettings, escape_directions
 from dt_viz.avoidance.transform import MotionBelow, SidewaysFlow
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Diffeomorphism
 from dt_viz.flows.fields import Array, Mask, PointField
 from dt_viz.kernels.fields import ASIDE, TERM, Terms
 from dt_viz.obstacles.shapes import Obstacle
-from dt_viz.obstacles.union import Union
+from dt_viz.obstacles.union import Union, escape_lengths
 
 MAX_SAMPLES = 96
 """Largest number of samples that sides are compared by."""
@@ -125,14 +124,10 @@ class Encounter:
         return cls(obstacle, margin, motion.positions[inside], tangents, ends, tuple(others), plane)
 
     def detour(self, previous: Detour | None, settings: DetourSettings) -> Detour:
-        """Choose the side with the least detour, or the previous one while that costs little more.
+        """Choose the side with the least detour, or the previous one, carried over, while that costs little more.
 
         Where turning there at a limited rate would move the motions farther than going there at once, it is there at
         once: what has just come near may make the detours in between long.
-
-        Args:
-            previous: the detour that is carried over from the obstacle's last pose; None where there was none.
-            settings: how it is chosen.
         """
         found = escape_directions(
             self.points.T[None],

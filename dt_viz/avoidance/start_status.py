@@ -26,15 +26,7 @@ class StartStatus(Enum):
 
 
 def start_warnings(which: Mask, added: Mask, kind: Kind, how: str, source: str = "") -> Iterator[MotionWarning]:
-    """Yield warnings that starts are `how`: one about the task's, one about added ones, each numbered from 1.
-
-    Args:
-        which: (R,) starts that are.
-        added: (R,) starts that are added ones.
-        kind: of the warnings.
-        how: predicate of the text.
-        source: of the warnings.
-    """
+    """Yield warnings that starts `which` (R,) are `how`: one about the task's, one about `added` ones (R,)."""
     for group, of in ((~added, ""), (added, "added ")):
         numbers = 1 + np.flatnonzero(which[group])
         if len(numbers):

@@ -168,11 +168,5 @@ class Anchored(Planar):
     """Whether motions are to end at the place."""
 
     def deflected(self, motion: MotionBelow, made: Built, who: str) -> tuple[MotionWarning, ...]:
-        """Return warnings about wishes that are no longer met because obstacles are avoided.
-
-        Args:
-            motion: shown motions of the end effector.
-            made: result of `build`, which was satisfied.
-            who: name of who gives way, for the text.
-        """
+        """Return warnings about wishes, satisfied by what was made, that `who` gives way to obstacles does not meet."""
         return ()

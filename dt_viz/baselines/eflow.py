@@ -75,15 +75,7 @@ class Coupling(Diffeomorphism):
 
     @classmethod
     def of(cls, given: slice, moved: slice, W: Array, phases: Array, weights: Array) -> Coupling:
-        """Make a layer of its features.
-
-        Args:
-            given: coordinates that it reads.
-            moved: coordinates that it moves.
-            W: (2, F, |a|) frequencies of s and of t.
-            phases: (2, F).
-            weights: (2, F, |b|) of the features.
-        """
+        """Make a layer of frequencies W (2, F, |a|) and phases (2, F) of s and t, and their weights (2, F, |b|)."""
         num = W.shape[1]
         amplitudes = np.zeros((2, num, 2, weights.shape[2]), W.dtype)
         amplitudes[0, :, 0], amplitudes[1, :, 1] = weights
@@ -186,12 +178,9 @@ class EFlowSystem:
 
     @classmethod
     def of(cls, task: Task, arrays: Mapping[str, Array], precision: Any = np.float32) -> EFlowSystem:  # noqa: ANN401 - a numpy type
-        """Make the system that weights describe.
+        """Make the system of weights as `dt_viz.baselines.eflow_training.train` returns them for a task.
 
-        Args:
-            task: the task that they were trained for.
-            arrays: as `dt_viz.baselines.eflow_training.train` returns them.
-            precision: numpy type that the cosines are computed in; single costs less than a micrometre.
+        Cosines in single precision cost less than a micrometre.
         """
         dim = task.demonstrations[0].dimension
         couplings = [
@@ -217,14 +206,9 @@ class EFlowSystem:
         return rate[:, None] * np.linalg.solve(J, descent[..., None])[..., 0]
 
     def rollouts(self, starts: Array, spacing: float) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-        """Motions to the goal, exact but for their times, whose integral is a sum of trapezia.
+        """Motions from starts (R, 3), metres: paths (T, 3), sampled no farther than `spacing` apart, and times (T,), s.
 
-        Args:
-            starts: (R, 3), metres.
-            spacing: largest distance between neighbouring samples, metres.
-
-        Returns:
-            For each start a path (T, 3), metres, and its times (T,), seconds.
+        They are exact but for the times, whose integral is a sum of trapezia.
         """
         rays = self.transform.forward(starts) - self.latent_goal
 

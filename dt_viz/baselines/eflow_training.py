@@ -46,16 +46,10 @@ Tensors = dict[str, "torch.Tensor"]
 
 
 def train(problem: Problem, num_epochs: int, report: Callable[[str], None], seed: int = 0) -> dict[str, Array]:
-    """Train EFlow on the demonstrations of a task.
+    """Train EFlow on the demonstrations of a task, for a number of steps on all points each.
 
-    Args:
-        problem: the task.
-        num_epochs: number of steps, each on all points.
-        report: takes a line of progress.
-        seed: of the features and of the speed's first weights.
-
-    Returns:
-        Arrays for `dt_viz.baselines.eflow.EFlowSystem.of`: of the epoch with the least loss.
+    Returns the arrays for `dt_viz.baselines.eflow.EFlowSystem.of` with the least loss; `report` takes lines of
+    progress.
 
     Raises:
         NotFittedError: nothing can be learned from the demonstrations.

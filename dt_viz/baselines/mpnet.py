@@ -195,12 +195,7 @@ class MPNetPlanner:
 
 
 def fit(problem: Problem, replan: Replan | None = None, folder: Path = FOLDER) -> Planner:
-    """Load the task's network.
-
-    Args:
-        problem: the task.
-        replan: plans again what the network finds no free way for.
-        folder: of the weights.
+    """Load the task's network, and `replan`, which plans again what the network finds no free way for.
 
     Raises:
         NotFittedError: there are no weights that can be used, or it is another arm.

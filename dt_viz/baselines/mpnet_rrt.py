@@ -39,15 +39,7 @@ def _connected(search: Search, start: Array, goal: Array, seconds: float) -> lis
 def rrt_connect(
     free: Callable[[Array, Array], bool], robot: Robot, start: Array, goal: Array, seconds: float
 ) -> list[Array]:
-    """Find a free way between two postures (n,), rad, seeded; empty if none was found in time.
-
-    Args:
-        free: decides whether the straight line between two postures is free.
-        robot: the arm.
-        start: where it begins.
-        goal: where it ends.
-        seconds: the time that it may take.
-    """
+    """Find a way between two postures (n,), rad, of lines that are `free`, seeded; empty if there is none in time."""
     deadline, raised = time.monotonic() + seconds, []
 
     def is_over() -> bool:

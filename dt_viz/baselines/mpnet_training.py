@@ -32,16 +32,9 @@ SETTINGS = TrainingSettings()
 
 
 def train(problem: Problem, num_epochs: int, report: Callable[[str], None], seed: int = 0) -> dict[str, Array]:
-    """Train MPNet on the demonstrations of a task, also backwards, as it plans from both ends.
+    """Train MPNet on a task's demonstrations, also backwards, as it plans from both ends; an epoch passes all steps.
 
-    Args:
-        problem: the task.
-        num_epochs: number of passes through all steps.
-        report: takes a line of progress.
-        seed: of the initial weights, the dropout and the order of the steps.
-
-    Returns:
-        Arrays for `dt_viz.baselines.mpnet.Network.of`.
+    Returns the arrays for `dt_viz.baselines.mpnet.Network.of`; `report` takes lines of progress.
 
     Raises:
         NotFittedError: the demonstrations do not move the arm.
@@ -103,14 +96,7 @@ def initial(widths: tuple[int, ...], rng: np.random.Generator) -> dict[str, Arra
 def loss_and_gradient(
     arrays: dict[str, Array], x: Array, y: Array, rng: np.random.Generator
 ) -> tuple[float, dict[str, Array]]:
-    """Mean squared error of a network's outputs with dropout, and its gradient by backpropagation.
-
-    Args:
-        arrays: of the network.
-        x: (N, in) inputs.
-        y: (N, out) targets.
-        rng: draws the neurons that are left out.
-    """
+    """Mean squared error of a network's outputs with dropout for `x` (N, in), `y` (N, out), and its gradient."""
     network = Network.of(arrays)
     masks = network.masks(rng, len(x))
     inputs, sums = network.traced(x, masks)

@@ -80,14 +80,7 @@ class PlanningScene:
 
 
 def planned(problem: Problem, queries: Sequence[Query], ways: Sequence[Array], warnings: tuple[str, ...] = ()) -> Plan:
-    """Make motions of corners in joint space: straight between them, even in joint space but for the velocity limits.
-
-    Args:
-        problem: what the method was fitted to.
-        queries: what was asked for.
-        ways: corners (K_i, n), rad, for each of them.
-        warnings: what the motions fail at.
-    """
+    """Make motions of corners (K_i, n), rad: straight between them, even in joint space but for the velocity limits."""
     paths, times, joints = [], [], []
     for query, way in zip(queries, ways, strict=True):
         length = arc_length(way)

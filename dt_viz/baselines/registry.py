@@ -108,10 +108,6 @@ TRAINED: Mapping[str, Trained] = {
 def problem_of(learned: Learned, follower: Follower) -> Problem:
     """The problem of a task: its demonstrations, our imitation of them, and the arm along each demonstration.
 
-    Args:
-        learned: the task, learned.
-        follower: the arm; that of an engine knows the task's postures already.
-
     Raises:
         UnreachableError: the arm cannot get to where the task's motions start.
     """

@@ -31,15 +31,8 @@ class WeightsError(DataError):
 def save_weights(path: Path, method: str, version: int, task: Task, arrays: Mapping[str, Array]) -> None:
     """Write the weights of a method for a task, floats in single precision, large arrays of them in half.
 
-    Args:
-        path: the file; `weights_file` names the one that `load_weights` reads.
-        method: name of the method.
-        version: of its format, raised with every change to what the arrays mean.
-        task: whose demonstrations it was trained on.
-        arrays: what was learned, finite numbers; no name begins with an underscore.
-
-    Raises:
-        OSError: the file cannot be written.
+    Numbers are finite, and no array's name begins with an underscore; `weights_file` names the path that is read again.
+    Raises OSError where the file cannot be written.
     """
     stored = {
         name: array.astype(np.float32 if array.size < HALF_FROM else np.float16) if array.dtype.kind == "f" else array

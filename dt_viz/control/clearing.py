@@ -66,16 +66,10 @@ def clearing(
     turn: float,
     end: Array | None,
 ) -> Clearing:
-    """Find the way around obstacles.
+    """Find the way around obstacles with velocities (P, 3), m/s, for postures q (N, n) of an undisturbed motion.
 
-    Args:
-        arm: whose body points are to be clear.
-        q: (N, n) postures of the undisturbed motion that are to be clear, in their order, rad.
-        avoidance: what is to be avoided, and by how much.
-        velocities: (P, 3) of the obstacles, m/s.
-        before: whose escape directions are gone on with; those of obstacles that are not in the way any more are kept.
-        turn: largest angle by which a direction turns away from that before, rad.
-        end: (n,) free posture beside which the clearance may be what it has itself; None is none.
+    Escape directions of `before` are gone on with, and turn by an angle `turn`, rad, at most; those of obstacles that
+    are not in the way any more are kept. Beside a free posture `end` (n,) the clearance may be what it has itself.
     """
     if avoidance is None or not avoidance.avoided.parts:
         return Clearing()
@@ -91,19 +85,11 @@ def clearing(
 def checked(
     arm: WholeArm, found: Clearing, q: Array, avoidance: ArmAvoidance | None, before: Clearing, end: Array, near: float
 ) -> Clearing:
-    """The same way around obstacles at rest, or another one where it leads into an obstacle.
+    """The same way around obstacles at rest, or another one where it leads into an obstacle; see `clearing`.
 
     A posture that is clear by itself may be carried into an obstacle, on whose other side it is: then other escape
-    directions are tried, that before first. Where none leads around, what was found is left as it is.
-
-    Args:
-        arm: see `clearing`.
-        found: what was found.
-        q: (N, n) postures of the undisturbed motion, rad.
-        avoidance: see `clearing`.
-        before: see `clearing`.
-        end: see `clearing`.
-        near: clearance that postures must have at least, metres, or beside `end` what that lacks of the margin more.
+    directions are tried, that before first. Where none leads around, what was found is left as it is. Postures must
+    have the clearance `near`, metres, or beside `end` what that lacks of the margin more.
     """
     if avoidance is None or found.field is None:
         return found
@@ -147,12 +133,7 @@ def _by(
 
 
 def _escapes(
-    arm: WholeArm,
-    q: Array,
-    avoidance: ArmAvoidance,
-    velocities: Array,
-    before: Sequence[Array | None],
-    num: int,
+    arm: WholeArm, q: Array, avoidance: ArmAvoidance, velocities: Array, before: Sequence[Array | None], num: int
 ) -> list[list[Array] | None]:
     """At most `num` escape directions (3,) from each obstacle, the best first; None where no posture is too near it."""
     chain = arm.robot.chain(q.T)

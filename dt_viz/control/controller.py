@@ -1,8 +1,8 @@
 """The robot in the loop: one law for where it is to be, one quadratic programme a tick for how it gets there.
 
 With q(t) the course, the undisturbed motion of the joints, and ψ_q the flow around obstacles, made for where these will
-be, the robot's target is p(t) = ψ_q⁻¹(q(t)): while nothing moves, the motion of eq. (4) lifted to the joints
-(`control.arm_system`). Each tick finds the velocity nearest to ṗ + g·(p − robot) among the feasible ones
+be, the robot's target is p(t) = ψ_q⁻¹(q(t)): while nothing moves, the motion of eq. (4), lifted to the joints by a
+section (`control.section`). Each tick finds the velocity nearest to ṗ + g·(p − robot) among the feasible ones
 (`control.feasible`). The clock of the course waits in proportion to the gap, so that a robot that had to give way takes
 up its motion where it left it. Home, hold and shove are other courses of the same loop.
 """
@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dt_viz.avoidance.avoidance import ArmAvoidance
-from dt_viz.control.arm_system import ArmSystem, Section
 from dt_viz.control.courses import Course, Progress, resting, shoved, straight_to, towards
 from dt_viz.control.feasible import FeasibleVelocities, Tick
 from dt_viz.control.obstacle_flow import ObstacleFlow
+from dt_viz.control.section import Section
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.flows.fields import Array
 from dt_viz.flows.rollouts import ARRIVED
@@ -77,11 +77,7 @@ class ArmController:
     ) -> None:
         """Take an arm and the stack that it follows first; its state is that of the first `step`.
 
-        Args:
-            follower: the arm.
-            solved: as in `follow`.
-            settings: None are the defaults.
-            rollout: number of the one that is begun, from 0; None draws the pattern of the nearest demonstration.
+        It begins the rollout of this number, from 0; None draws the pattern of the nearest demonstration.
 
         Raises:
             UnreachableError: the arm cannot get to where the motions start.
@@ -133,15 +129,6 @@ class ArmController:
         with self._lock:
             if self._progress is not None:
                 self._flow.settle(self._progress)
-
-    @property
-    def system(self) -> ArmSystem:
-        """The system of eq. (4) whose motion it is."""
-        with self._lock:
-            stack, rest = self._solved.stack, self._solved.stack.rays.z0[0, 3:]
-            if self._progress is not None and self._activity.seeks_goal:
-                rest = self._progress.image[3:]
-            return ArmSystem(stack.at_phase(rest), self._section, self._flow.transform)
 
     # --- What it is told to do ---
 

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from dt_viz.avoidance.arm_field import JointLimits
-from dt_viz.control.arm_system import Section
+from dt_viz.control.section import Section
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.flows.fields import Array
 from dt_viz.flows.rollouts import ARRIVED, Rays, evenly_sampled

@@ -63,24 +63,10 @@ class FeasibleVelocities:
         """Keep the distances from the table, and of the arm's parts, of a motion along postures q (N, n)."""
         self._kept = tuple(limit.kept(q) for limit in self._contacts)
 
-    def tick(
-        self,
-        q: Array,
-        wanted: Array,
-        dt: float,
-        before: Tick | None,
-        seen: Sighting,
-        late: float,
-    ) -> Tick:
-        """Find the velocity for a tick.
+    def tick(self, q: Array, wanted: Array, dt: float, before: Tick | None, seen: Sighting, late: float) -> Tick:
+        """Find the velocity for a tick of `dt` seconds after the one before, at q (n,), rad, nearest to a wanted one.
 
-        Args:
-            q: (n,) rad.
-            wanted: (n,) rad/s.
-            dt: duration of the tick, seconds.
-            before: the last tick; None before the first one, when the robot stands still.
-            seen: the obstacles.
-            late: time since they were seen, seconds.
+        The obstacles were seen `late` seconds ago. Before the first tick the robot stands still.
         """
         velocity = np.zeros(len(q)) if before is None else before.velocity
         lower, upper = np.full(len(q), -np.inf), np.full(len(q), np.inf)
@@ -104,16 +90,8 @@ class FeasibleVelocities:
 
         Each of some velocities is foreseen for a short time: the joints turn to it as fast as they may and keep it, the
         obstacles go on as `ObstacleMotion` says. How near they come, in deviations of the obstacles from there, is its
-        worth. Choosing anew in each tick, that is model predictive control with one move, by enumeration.
-
-        Args:
-            q: (n,) rad.
-            velocity: (n,) now, rad/s.
-            wanted: (n,) rad/s.
-            before: (n,) the one of the last tick, rad/s; None is none.
-            seen: the obstacles.
-            late: time since they were seen, seconds.
-            floor: distance from the table that is to be kept, metres.
+        worth. Choosing anew in each tick, that is model predictive control with one move, by enumeration. A distance
+        `floor` from the table, metres, is kept.
         """
         settings, speeds = self._settings, np.linalg.norm(seen.velocities, axis=1)
         moving = np.flatnonzero(speeds > settings.slow)

@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 
 from dt_viz.avoidance.avoidance import ArmAvoidance
-from dt_viz.control.arm_system import Section
 from dt_viz.control.controller import ArmController, Phase
+from dt_viz.control.section import Section
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.evaluate.options import (
     Row,

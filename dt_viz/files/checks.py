@@ -67,15 +67,10 @@ def too_many(field: str, limit: int, unit: str = "") -> FormatError:
 
 
 def real_numbers(values: ArrayLike, field: str, kinds: str = "iuf") -> Array:
-    """Return an array as float64; values that overflow become infinite.
-
-    Args:
-        values: what should be an array of integers or real numbers.
-        field: its name, for messages.
-        kinds: the accepted kinds of types, in numpy's letters.
+    """Return an array of integers or real numbers, `kinds` in numpy's letters, as float64; large ones become infinite.
 
     Raises:
-        FormatError: its values are of another type.
+        FormatError: values of the field are of another type.
     """
     array = np.asarray(values)
     if array.dtype.kind not in kinds:

@@ -3,29 +3,28 @@
 from __future__ import annotations
 
 import io
+import logging
 import os
 import threading
 import zipfile
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from dt_viz.errors import FormatError
 
+logger = logging.getLogger(__name__)
+T = TypeVar("T")
+
 
 def arrays_of(content: bytes | Path, *, max_bytes: int, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
-    """Read the arrays of an npz archive.
-
-    Args:
-        content: all bytes of the file, or its path.
-        max_bytes: largest number of bytes that it may unpack to, as its directory says.
-        names: names of the arrays to read; None reads all.
+    """Read the arrays of an npz archive, its bytes or its path: some by their names, None reads all.
 
     Raises:
-        FormatError: it unpacks to more.
+        FormatError: it unpacks to more than `max_bytes`, as its directory says.
         Exception: of almost any kind, if it is no archive, damaged, or holds pickled objects.
     """
     file = io.BytesIO(content) if isinstance(content, bytes) else content
@@ -70,3 +69,23 @@ def write_whole(path: Path, content: bytes) -> None:
     finally:
         with suppress(OSError):  # it has been moved
             partial.unlink()
+
+
+def write_cached(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Store arrays in a cache; a folder that cannot be written to is only logged."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path, npz_bytes(arrays))
+    except OSError as error:
+        logger.warning("%s was not cached: %s", path, error)
+
+
+def read_cached(path: Path, make: Callable[[dict[str, np.ndarray]], T], max_bytes: int) -> T | None:
+    """Make something of arrays from a cache; None where there are none, or, which is logged, they are damaged."""
+    if not path.exists():
+        return None
+    try:
+        return make(arrays_of(path.read_bytes(), max_bytes=max_bytes))
+    except Exception as error:  # damaged bytes make zipfile and zlib raise almost anything
+        logger.warning("%s is damaged and will be made anew: %s", path, error)
+        return None

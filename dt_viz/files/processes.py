@@ -14,16 +14,9 @@ from typing import IO, Any
 def start_module(
     name: str, *arguments: str, output: int | IO[Any], given: int = subprocess.DEVNULL, temporary: str | None = None
 ) -> subprocess.Popen:
-    """Start a module of this package as a process, with one thread for linear algebra.
+    """Start a module of this package, by its full name, as a process, with one thread for linear algebra.
 
     With a folder of temporary files it has a session of its own, which `end_session` ends with all its processes.
-
-    Args:
-        name: full name of the module.
-        arguments: of its command line.
-        output: file or pipe of its standard output.
-        given: that of its standard input.
-        temporary: folder of its temporary files; None is the usual one.
     """
     root = Path(__file__).parents[2]  # holds this package
     path = os.pathsep.join([str(root), *filter(None, sys.path)])

@@ -73,10 +73,7 @@ class Recordings:
 def read_recordings(files: Sequence[tuple[str, bytes]], answers: Answers, joint_names: Sequence[str]) -> Recordings:
     """Read what a visitor sent, each a name and its content, in the process of `dt_viz.files.worker`.
 
-    Args:
-        files: recordings, or archives of folders of them.
-        answers: what was answered to the questions of earlier readings.
-        joint_names: names of the joints of the arm at hand.
+    They are recordings, or archives of folders of them; answers are to the questions of earlier readings.
 
     Raises:
         FormatError: none of them can be read; it says why the first cannot.

@@ -19,12 +19,7 @@ from dt_viz.numerics import Array, Indices, Mask
 def repaired(vertices: Array, faces: Indices) -> tuple[Array, Indices, tuple[str, ...]]:
     """Merge coinciding vertices, turn triangles as most of their neighbours, outwards, and fill holes of 3 or 4 edges.
 
-    Args:
-        vertices: (V, 3), finite.
-        faces: (F, 3), indices of vertices.
-
-    Returns:
-        Vertices and faces of the repaired mesh, and notes about it for the page.
+    Returns vertices (V, 3) and faces (F, 3) of the repaired mesh, and notes about it for the page.
 
     Raises:
         FormatError: its triangles have no area, or no side is the outer one.

@@ -79,12 +79,8 @@ READERS: Mapping[str, tuple[Reader, str]] = {
 def read_takes(path: Path, options: ReadOptions) -> tuple[list[Take], tuple[str, ...]]:
     """Read the takes of a file, in its units; `in_si_units` changes these over all files.
 
-    Args:
-        path: of the file; its suffix says what it is, the stem names takes that have no name.
-        options: what is known beside the file.
-
-    Returns:
-        The takes, and notes on what was chosen and what is not used.
+    Its suffix says what it is, the stem names takes that have no name. Returns also notes on what was chosen or is not
+    used.
 
     Raises:
         FormatError: it is none of `READERS`, too large, or there are no takes in it.
@@ -261,17 +257,11 @@ def _unit_quaternions(turns: np.ndarray) -> np.ndarray | None:
 
 
 def in_si_units(takes: Sequence[Take], num_joints: int | None = None) -> tuple[list[Take], str]:
-    """Bring takes of one or several files into metres, seconds and radians.
+    """Bring takes of one or several files into metres, seconds and radians; changes them, and gives a note on units.
 
     Units that the files do not say are recognised over all takes: coordinates beyond any arm's reach, steps in time
-    that no recorder has, and angles of more than two turns are in smaller units.
-
-    Args:
-        takes: of all files.
-        num_joints: number of the arm's joints, the first columns of angles; what follows is no angle. None is all.
-
-    Returns:
-        The takes, whose places or angles may have been changed in place, and a note if units were recognised.
+    that no recorder has, and angles of more than two turns are in smaller units. Angles are the first columns, one for
+    each of an arm's joints; None is all.
     """
     recognised = {}
     lengths = [take.positions for take in takes if take.positions is not None and "length" not in take.units]

@@ -149,16 +149,9 @@ def read_upload(
     cancelled: Cancelled = never,
     **options: Any,  # noqa: ANN401 - what JSON can hold
 ) -> T:
-    """Read files in another process.
+    """Read files, each a name and its content, in another process, as one of `dt_viz.files.worker.READERS`.
 
-    Args:
-        kind: class of what is read, one of `dt_viz.files.worker.READERS`.
-        files: name and content of each.
-        cancelled: whether nobody wants it any more.
-        options: further arguments of the reader.
-
-    Returns:
-        A value of that class, of its types; its arrays are finite, and of any shape.
+    The value is of that class and its types; its arrays are finite, and of any shape.
 
     Raises:
         FormatError: the files cannot be read, or not within the limits of memory and time.

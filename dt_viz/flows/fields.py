@@ -17,7 +17,7 @@ from dt_viz.numerics import Array, Indices, Mask  # noqa: F401 - other packages 
 
 
 class VectorField(Protocol):
-    """A Lipschitz vector field V: R^d → R^d that knows its derivative."""
+    """A Lipschitz vector field V: R^d → R^d."""
 
     @property
     def dim(self) -> int:
@@ -26,10 +26,6 @@ class VectorField(Protocol):
 
     def __call__(self, s: Array, /) -> Array:
         """V at the points `s` (N, d), as (N, d)."""
-        ...
-
-    def with_jacobian(self, s: Array, /) -> tuple[Array, Array]:
-        """V (N, d) and its derivative DV (N, d, d), DV[:, i, j] = ∂V_i/∂s_j, at the points `s` (N, d)."""
         ...
 
 
@@ -63,7 +59,7 @@ class PointField(ABC):
         return self.carried(s, None, RATE)[0]
 
     def with_jacobian(self, s: Array) -> tuple[Array, Array]:
-        """V (N, d) and DV (N, d, d) at the points `s` (N, d)."""
+        """V (N, d) and its derivative DV (N, d, d), DV[:, i, j] = ∂V_i/∂s_j, at the points `s` (N, d)."""
         V, DV = self.carried(s, np.broadcast_to(np.eye(self.dim), (len(s), self.dim, self.dim)), RATE)
         assert DV is not None
         return V, DV

@@ -23,13 +23,7 @@ their flows are straight, and errors of 1e-7 change a slope by some 1e-4."""
 
 
 def carried(
-    field: VectorField,
-    s: Array,
-    U: Array | None,
-    method: int,
-    duration: float,
-    steps: int = 1,
-    tolerance: float = 0.0,
+    field: VectorField, s: Array, U: Array | None, method: int, duration: float, steps: int = 1, tolerance: float = 0.0
 ) -> tuple[Array, Array | None]:
     """Carry points `s` (N, d) and tangents `U` (N, d, k) along the flow of a field, for a duration of either sign.
 

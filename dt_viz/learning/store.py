@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import logging
 import threading
 import time
 from contextlib import suppress
@@ -11,13 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from dt_viz.files.npz import arrays_of, npz_bytes, write_whole
+from dt_viz.files.npz import read_cached, write_cached
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.imitation import Imitation, ImitationSettings, Progress, fit
 from dt_viz.learning.interface import AnyImitation, State
 from dt_viz.learning.state import learn
-
-logger = logging.getLogger(__name__)
 
 FORMAT = 5
 """Version of the fit and its file; raised with every change, so that older files are not used."""
@@ -90,33 +87,17 @@ class FitStore:
             progress(*self._reports.get(key, (0.0, "looking for a stored fit")))
         try:
             if key not in self._memory:
-                self._memory[key] = self._read(key) or self._fit(key, demonstrations, settings, tell)
+                path = None if self._folder is None else self._folder / f"{key}.npz"
+                imitation = None if path is None else read_cached(path, Imitation.from_arrays, MAX_BYTES)
+                if imitation is None:
+                    imitation = fit(demonstrations, settings, tell)
+                    if path is not None:
+                        write_cached(path, imitation.to_arrays())
+                self._memory[key] = imitation
             return self._memory[key]
         finally:
             self._reports.pop(key, None)
             lock.release()
-
-    def _fit(
-        self, key: str, demonstrations: tuple[Demonstration, ...], settings: ImitationSettings, progress: Progress
-    ) -> Imitation:
-        imitation = fit(demonstrations, settings, progress)
-        if self._folder is not None:
-            try:
-                self._folder.mkdir(parents=True, exist_ok=True)
-                write_whole(self._folder / f"{key}.npz", npz_bytes(imitation.to_arrays()))
-            except OSError as error:
-                logger.warning("the fit was not cached: %s", error)
-        return imitation
-
-    def _read(self, key: str) -> Imitation | None:
-        path = self._folder / f"{key}.npz" if self._folder is not None else None
-        if path is None or not path.exists():
-            return None
-        try:
-            return Imitation.from_arrays(arrays_of(path.read_bytes(), max_bytes=MAX_BYTES))
-        except Exception as error:  # damaged bytes make zipfile and zlib raise almost anything
-            logger.warning("%s is damaged and will be fitted anew: %s", path, error)
-            return None
 
 
 def _remove_leftovers(folder: Path) -> None:

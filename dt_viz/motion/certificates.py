@@ -134,11 +134,7 @@ class DrawnSamples:
 def certified(known: Certificates, stack: Solution, shown: DrawnSamples, *, tolerance: float = MAX_OFF) -> Certificates:
     """Add the certificates of a stack along the motions that are shown of it, and a warning for each that fails.
 
-    Args:
-        known: what is known already.
-        stack: ψ and the rays of the base system.
-        shown: the motions.
-        tolerance: distance of ψ of a sample from its base motion, metres, before it is said.
+    Beyond a tolerance, metres, it is said that ψ of a sample is off its base motion.
     """
     base = stack.rays.base
     base_motion = base.flow(stack.rays.z0[shown.index], shown.times[:, None])[:, 0]
@@ -166,15 +162,8 @@ def certified_map(
 ) -> tuple[Certificates, Array]:
     """The worse of the certificates known and of those of a map, with a warning for each failure, and its images.
 
-    Args:
-        known: what is known already.
-        transform: ψ.
-        y: (N, d) samples that are drawn.
-        x: (N, d) what ψ⁻¹ is said to lead to them.
-        num: number of samples at which det J and the round trip are computed, of those that it moves.
-        tolerance: distance of an image from `x`, metres, before it is said.
-        unit: metres for one unit of each coordinate.
-        by_hand: whether an integration was chosen by hand.
+    They are of `num` of the samples y (N, d) that it moves, which ψ⁻¹ is said to lead to from `x` (N, d): beyond a
+    tolerance, metres, it is said that it does not. One unit of each coordinate is `unit` metres.
     """
     moved = np.flatnonzero((y != x).any(axis=1))
     rows = moved if len(moved) else np.arange(len(y))

@@ -153,16 +153,9 @@ def integration_warnings(
 ) -> tuple[MotionWarning, ...]:
     """Warnings about the integration of a transform's flow, if it was chosen by hand.
 
-    Quick enough for a drag. A flow in other coordinates, as the whole arm's, is too slow to be looked at for folds
-    here: see `fold_warnings`.
-
-    Args:
-        name: of the transform.
-        flow: its ψ.
-        integration: of that flow.
-        y: (N, d) samples of the motions with the transform.
-        x: (N, d) the samples below, which ψ⁻¹ leads to `y`.
-        unit: metres for one unit of each coordinate.
+    Quick enough for a drag: along samples y (N, d) of motions, and those below, x (N, d), which ψ⁻¹ leads to them. A
+    flow in other coordinates, as the whole arm's, is too slow to be looked at for folds here: see `fold_warnings`. One
+    unit of each coordinate is `unit` metres.
     """
     if not integration.by_hand:
         return ()

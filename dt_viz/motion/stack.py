@@ -10,7 +10,7 @@ import numpy as np
 from dt_viz.avoidance.detour import Detour, carried_over
 from dt_viz.avoidance.passing import ANEW, Passing
 from dt_viz.avoidance.transform import Anchored, Built, MotionBelow, Transform
-from dt_viz.flows.augmented_systems import OnPlaces, frozen, on_places
+from dt_viz.flows.augmented_systems import OnPlaces, on_places
 from dt_viz.flows.diffeomorphisms import Chain, Diffeomorphism, Identity
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.rollouts import Bundle, Rays, refined
@@ -85,10 +85,6 @@ class Solution:
         """The transforms on the imitation together, of places (3,)."""
         parts: list[Diffeomorphism] = [applied.made.transform for applied in self.built]
         return Chain(parts) if parts else Identity(3)
-
-    def at_phase(self, rest: Array) -> DiffeomorphicSystem:
-        """The system of places (3,), for the other coordinates (k − 3,) of the state; see `frozen`."""
-        return frozen(self.system, rest)
 
     @property
     def warnings(self) -> tuple[MotionWarning, ...]:

@@ -71,16 +71,10 @@ def is_cloud(content: bytes, source: str | Path) -> bool:
 def read_mesh(
     content: bytes, source: str | Path, *, scale: float = 1.0, cancelled: Cancelled = never
 ) -> tuple[Solid, tuple[str, ...]]:
-    """Read a closed mesh from the bytes of a file, such as one uploaded from the browser.
+    """Read a closed mesh from the bytes of a file, whose `source` has the suffix that says what it is.
 
-    Args:
-        content: all bytes of the file.
-        source: its name or path; the suffix says what it is.
-        scale: metres for one unit of the file.
-        cancelled: whether nobody wants it any more.
-
-    Returns:
-        The solid, and notes for the page on what was repaired and what is inexact.
+    One unit of the file is `scale` metres. Returns the solid, and notes for the page on what was repaired and is
+    inexact.
 
     Raises:
         ShapeError: the file is not what its suffix says, or holds no closed mesh of a sensible size. Nothing else is

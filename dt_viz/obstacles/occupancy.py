@@ -88,17 +88,10 @@ def fit_occupancy(
 def sample_labels(
     inside: Callable[[Array], Mask], lower: Array, upper: Array, num_samples: int, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Draw labelled samples {(s_k, o_k)} of a shape, uniform in its grown bounding box, half of them close to it.
+    """Draw labelled samples (K, d), (K,) of a shape, uniform in its grown bounding box, half of them close to it.
 
-    Args:
-        inside: tells for points (N, d) whether they are occupied, (N,) bool.
-        lower: (d,) lower corner of the shape's bounding box.
-        upper: (d,) upper corner.
-        num_samples: K.
-        rng: source of randomness.
-
-    Returns:
-        Samples (K, d) and labels (K,), 1 occupied and 0 free.
+    Labels are 1 where `inside` tells that points (N, d) are occupied, else 0; the box is from `lower` (d,) to `upper`
+    (d,).
     """
     centre, half = (lower + upper) / 2, (upper - lower) / 2
     growth = np.where(np.arange(num_samples) % 2 == 0, 1.25, 3.0)

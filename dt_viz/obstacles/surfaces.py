@@ -19,14 +19,10 @@ def box_surface(half: Array) -> tuple[Array, Indices]:
 
 
 def lathe(profile: Sequence[tuple[float, float]], num: int = 48) -> tuple[Array, Indices]:
-    """Return the closed surface of revolution of a profile around z.
+    """Return the closed surface, vertices (V, 3), metres, and faces (F, 3), outward, of a profile turned around z.
 
-    Args:
-        profile: distances from the axis and heights, metres, from the axis up along the outside and back to it.
-        num: number of sides.
-
-    Returns:
-        Vertices (V, 3), metres, and faces (F, 3), outward.
+    The profile has distances from the axis and heights, metres, from the axis up along the outside and back to it; the
+    surface has `num` sides.
     """
     (_, bottom), *rings, (_, top) = profile
     turn, here = 2 * np.pi * np.arange(num) / num, np.arange(num)

@@ -44,19 +44,13 @@ def grid_nodes(origin: Array, cell: float, shape: tuple[int, ...]) -> Array:
 def inside_of_grid(
     triangles: Array, origin: Array, cell: float, shape: tuple[int, ...], *, closed: bool = False
 ) -> Mask:
-    """Find the nodes of a grid that triangles (F, 3, 3) enclose, by winding numbers along lines.
+    """Find the nodes of a grid that triangles (F, 3, 3) enclose, by winding numbers along lines; a few may be missing.
 
-    The lines of two of the three directions must agree, since a line through a small hole counts wrongly.
-
-    Args:
-        triangles: corners, metres; a few of them may be missing.
-        origin: (3,) first node, metres.
-        cell: distance between neighbouring nodes, metres.
-        shape: number of nodes along each axis.
-        closed: whether triangles with large holes are refused.
+    The lines of two of the three directions must agree, since a line through a small hole counts wrongly. The grid has
+    its first node at `origin` (3,) and others every `cell`, metres.
 
     Raises:
-        FormatError: very many triangles are long or overlap; or they have large holes.
+        FormatError: very many triangles are long or overlap; or they have large holes, where they are to be `closed`.
     """
     votes = np.zeros(shape, dtype=np.int8)
     for axis in range(3):

@@ -13,6 +13,9 @@ from dt_viz.obstacles.shapes import Obstacle, nearest
 from dt_viz.obstacles.solids import with_slopes
 from dt_viz.obstacles.surfaces import golden_spiral
 
+MAX_STEPS, SHORTEST = 100, 1e-4
+"""Largest number of steps along a line, and the smallest one, metres: bounds the overshoot beyond the surface."""
+
 
 @dataclass(frozen=True)
 class Union:
@@ -53,14 +56,8 @@ class Union:
         if self.signed_distance(free)[0] >= 0:  # no free place is nearer
             return free[0]
         directions = golden_spiral(500) * [1, -1, -1]
-        length, shortest = np.zeros(len(directions)), 1e-4  # metres; bounds the overshoot
-        for _ in range(200):
-            depth = -self.signed_distance(s + length[:, None] * directions)
-            if depth[length.argmin()] <= 0:
-                break
-            length += np.where(depth > 0, np.maximum(depth, shortest), 0)
-        nearest = length.argmin()
-        return s + length[nearest] * directions[nearest]
+        length = escape_lengths(self, s, directions)
+        return s + length.min() * directions[length.argmin()]
 
     def cover(self) -> tuple[Array, Array]:
         """Cover all parts by balls: centres (K, 3) and radii (K,), metres."""
@@ -70,3 +67,14 @@ class Union:
     def field(self, generator: Generator, temperature: float) -> Sum:
         """Return the sum of the parts' generators (sec. 4.4)."""
         return Sum(tuple(part.field(generator, temperature) for part in self.parts))
+
+
+def escape_lengths(obstacle: Obstacle | Union, points: Array, directions: Array, margin: float = 0.0) -> Array:
+    """How far points (N, 3) have to go along unit vectors (N, 3), or one for all, to keep a margin: (N,) metres."""
+    length = np.zeros(np.broadcast_shapes(points.shape, directions.shape)[:-1])
+    for _ in range(MAX_STEPS):
+        lacking = margin - obstacle.signed_distance(points + length[:, None] * directions)
+        if lacking.max() <= 0:
+            break
+        length += np.where(lacking > 0, np.maximum(lacking, SHORTEST), 0)
+    return length

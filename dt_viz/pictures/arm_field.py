@@ -52,13 +52,9 @@ class Lattice:
         return cls(reached, q[:, 0], np.moveaxis(q[:, 1:] - q[:, :1], 1, 2) / STEP)
 
     def carried(self, velocities: Array, transform: Diffeomorphism, robot: Robot, obstacle: Union) -> FieldPicture:
-        """Carry a field's arrows along by the whole arm's avoidance.
+        """Carry arrows (M, 3), m/s, NaN where there is none, along by the whole arm's avoidance ψ_q.
 
-        Args:
-            velocities: (M, 3) of the motion below the arm's avoidance, m/s; rows of NaN have no arrow.
-            transform: ψ_q.
-            robot: the arm.
-            obstacle: what is avoided: ψ_q was made for the motions, and may leave arrows far from them in it.
+        That was made for the motions, and may leave arrows far from them in the obstacle: these are left out.
         """
         limits, speed = JointLimits(robot.lower, robot.upper), np.linalg.norm(velocities[self.reached], axis=1)
         moving = speed > 0

@@ -64,17 +64,7 @@ def system_panel(
     *,
     coarse: bool,
 ) -> PanelPicture:
-    """Return the picture of a system.
-
-    Args:
-        title: what is written over it.
-        system: what it shows.
-        rollouts: (T_i, 3) motions of the system, metres.
-        area: its rectangle.
-        obstacle: what no motion comes into.
-        demonstrations: (T_i, 3) drawn beside the rollouts.
-        coarse: whether it is soon replaced.
-    """
+    """Return the picture of a system in an area, with rollouts and demonstrations (T_i, 3), metres, and an obstacle."""
     outlines, clearance = np.zeros((0, 2, 3)), everywhere
     if obstacle is not None and obstacle.parts:
         clearance, lattice = obstacle.signed_distance, area.grid(OUTLINE_SPACING)

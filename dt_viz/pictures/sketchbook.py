@@ -98,14 +98,9 @@ class Sketchbook:
         return Placed(flows, self.task.origin, self.task.axes, self.task.scale)
 
     def grid(self, area: Slice, transforms: Sequence[Diffeomorphism], *, coarse: bool) -> Array:
-        """Return segments (K, 2, 3), metres, of the warped grid.
+        """Return segments (K, 2, 3), metres, of the warped grid on a slice, bent by transforms from the inside out.
 
         Level lines of the imitation's coordinates are found once, and bent by what is stacked on it.
-
-        Args:
-            area: the slice.
-            transforms: stacked on the imitation, from the inside out.
-            coarse: whether to use fewer points, for a picture that is soon replaced.
         """
         points, ends = self._memo("grid", (area.key, coarse), lambda: self._grid(area, coarse=coarse), newest=4)
         longest = np.linalg.norm(np.diff(points[ends], axis=1), axis=2).max(initial=0.0)

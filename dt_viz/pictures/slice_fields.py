@@ -119,13 +119,7 @@ class Samples:
 
 
 def arrows_and_colour(
-    system: DiffeomorphicSystem,
-    area: Slice,
-    clearance: Clearance,
-    colour: SliceColour,
-    *,
-    arrows: bool,
-    coarse: bool,
+    system: DiffeomorphicSystem, area: Slice, clearance: Clearance, colour: SliceColour, *, arrows: bool, coarse: bool
 ) -> tuple[FieldPicture | None, ColourPicture | None]:
     """Compute velocities on the slice, if `arrows` are wanted, and the function that the `colour` shows, if any.
 

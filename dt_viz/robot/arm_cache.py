@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import hashlib
-import logging
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from dt_viz.files.npz import arrays_of, npz_bytes, write_whole
+from dt_viz.files.npz import read_cached, write_cached
+from dt_viz.flows.fields import Array
 from dt_viz.kernels.arm import BODY_POINT
 from dt_viz.robot.body_points import BodyPoints
 from dt_viz.robot.meshes import LinkMesh, VisualMesh, constant
 from dt_viz.robot.robot import Robot
-
-if TYPE_CHECKING:
-    from dt_viz.flows.fields import Array
-
-logger = logging.getLogger(__name__)
 
 FORMAT = 5
 """Version of what is found of an arm and of its file; raised with every change, so that older files are not used."""
@@ -39,28 +34,13 @@ def digest(parts: Iterable[bytes]) -> str:
 
 
 def write(path: Path, robot: Robot) -> None:
-    """Store an arm; a folder that cannot be written to is only logged."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, npz_bytes(to_arrays(robot)))
-    except OSError as error:
-        logger.warning("the arm was not cached: %s", error)
+    """Store an arm, if that can be."""
+    write_cached(path, to_arrays(robot))
 
 
 def read(path: Path, given: Mapping[str, Any]) -> Robot | None:
-    """Read an arm that was stored; None where there is none, or it is damaged.
-
-    Args:
-        path: the file.
-        given: fields of the arm that are not stored: where it comes from, and its names.
-    """
-    if not path.exists():
-        return None
-    try:
-        return from_arrays(arrays_of(path.read_bytes(), max_bytes=MAX_BYTES), given)
-    except Exception as error:  # damaged bytes make zipfile and zlib raise almost anything
-        logger.warning("%s is damaged and will be made anew: %s", path, error)
-        return None
+    """Read an arm that was stored, with `given` fields that are not; None where there is none, or it is damaged."""
+    return read_cached(path, lambda arrays: from_arrays(arrays, given), MAX_BYTES)
 
 
 def to_arrays(robot: Robot) -> dict[str, np.ndarray]:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.kernels.arm import BODY_POINT
@@ -15,9 +14,6 @@ from dt_viz.kernels.blocks import clearance
 from dt_viz.obstacles.shapes import Obstacle, records
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.kinematics import KinematicChain, Kinematics
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 PROTRUSION = 5e-3
 """Largest distance by which the spheres that cover the JACO's links stick out of these, metres; 3 mm on average. Other

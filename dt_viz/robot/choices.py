@@ -8,22 +8,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from dt_viz.errors import FormatError
+from dt_viz.flows.fields import Array
 from dt_viz.robot.body_points import BodyPoints
 from dt_viz.robot.collision import SELF_MARGIN, CollisionModel
 from dt_viz.robot.kinematics import Kinematics
 from dt_viz.robot.link_distances import BetweenLinks, Poses
 from dt_viz.robot.meshes import LinkMesh
 from dt_viz.robot.urdf import listed, numbers
-
-if TYPE_CHECKING:
-    from xml.etree.ElementTree import Element
-
-    from dt_viz.flows.fields import Array
 
 AXES = {"x": (1.0, 0.0), "-x": (-1.0, 0.0), "y": (0.0, 1.0), "-y": (0.0, -1.0)}
 
@@ -91,12 +88,8 @@ def find_front(
 ) -> tuple[Array, str]:
     """Find the horizontal unit vector (2,) ahead of the arm in the base frame of its URDF, and say why.
 
-    Args:
-        kinematics: in that frame.
-        ranges: of the angles.
-        given: "x", "-x", "y", "-y" or a direction; None finds one.
-        home: (n,) the given home, rad, if there is one.
-        settings: of the choice.
+    What is given is "x", "-x", "y", "-y" or a direction; None finds one, by the given `home` (n,), rad, if there is
+    one.
 
     Raises:
         FormatError: what is given is no horizontal direction.

@@ -10,22 +10,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
+from dt_viz.flows.fields import Array, Indices
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.kinematics import Kinematics
 from dt_viz.robot.link_distances import AboveTable, BetweenLinks, FromObstacle, Link, Measure, Poses, page_names
 from dt_viz.robot.meshes import LinkMesh
 from dt_viz.warning import ARM, Kind, MotionWarning
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
-    from dt_viz.flows.fields import Array, Indices
-
 
 SELF_REACH = 0.05
 """Distance of links beyond which it is not measured, metres: between the ends of the JACO's wrist are at most 7 cm."""
@@ -224,12 +220,8 @@ class CollisionModel:
     def obstacle_distance(self, q: ArrayLike, obstacle: Obstacle) -> tuple[Array, Indices]:
         """Compute the smallest signed distance of any point of the arm from the obstacle, and the nearest link.
 
-        Args:
-            q: (T, n) configurations, rad.
-            obstacle: in the base frame.
-
-        Returns:
-            Distances (T,), metres, negative inside; indices (T,) into `links`.
+        For configurations q (T, n), rad, these are distances (T,), metres, negative inside, and indices (T,) into
+        `links`.
         """
         q = np.asarray(q, dtype=float)
         measure, poses = FromObstacle(self.links, obstacle), Poses.of(self.robot, q)

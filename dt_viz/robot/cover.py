@@ -14,21 +14,18 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, product
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
+from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.kernels.arm import BODY_POINT
 from dt_viz.obstacles.triangles import grid_nodes, inside_of_grid, surface_samples
 from dt_viz.robot.meshes import LinkMesh, cells
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from dt_viz.flows.fields import Array, Indices, Mask
 
 Progress = Callable[[float], object]
 """Is told the fraction that is done, in [0, 1]."""
@@ -83,16 +80,9 @@ def covering_tree(
     settings: CoverSettings = CoverSettings(),
     progress: Progress = float,
 ) -> NDArray[np.void]:
-    """Cover links with the spheres of `dt_viz.robot.body_points.BodyPoints`.
+    """Cover links with the spheres of `dt_viz.robot.body_points.BodyPoints`: (N,) of dtype `BODY_POINT`, by joint.
 
-    Args:
-        meshes: the links.
-        largest: the radius of a link's body points at most, metres.
-        settings: of the cover.
-        progress: is told how much is done.
-
-    Returns:
-        (N,) spheres of dtype `BODY_POINT`, by joint.
+    `largest` gives the radius of a link's body points at most, metres.
     """
     meshes = sorted(meshes, key=lambda mesh: mesh.joint)
     work = np.cumsum([0.0, *(_area(mesh) for mesh in meshes)])
@@ -110,15 +100,9 @@ def covering_tree(
 
 
 def protrusion(tree: NDArray[np.void], meshes: Sequence[LinkMesh], spacing: float = 2e-3) -> tuple[float, float]:
-    """Measure how far the spheres that cover links stick out of them.
+    """Measure how far spheres of a `covering_tree` stick out of links, by points at a spacing on their surfaces.
 
-    Args:
-        tree: as of `covering_tree`.
-        meshes: the links.
-        spacing: of points on the surfaces of spheres and links, metres.
-
-    Returns:
-        The mean over the outside of all spheres that move, and the largest such distance, metres.
+    Returns the mean over the outside of all spheres that move, and the largest such distance, metres.
     """
     found = [np.zeros(1)]
     for joint in np.unique([mesh.joint for mesh in meshes if mesh.joint >= 0]):
@@ -144,13 +128,7 @@ def _evenly(num: int) -> Array:
 
 
 def usual_radius(mesh: LinkMesh, reach: float, settings: CoverSettings) -> float:
-    """Compute the largest radius of a link's body points, metres, from its thickness: no less than holds it across.
-
-    Args:
-        mesh: the link.
-        reach: of the arm, metres.
-        settings: of the cover.
-    """
+    """Compute the largest radius of a link's body points, metres, from its thickness: no less than holds it across."""
     points = mesh.vertices - mesh.vertices.mean(axis=0)
     along = points @ np.linalg.svd(points, full_matrices=False)[2].T  # principal axes, the longest first
     sides = np.sort(np.ptp(along, axis=0))

@@ -11,11 +11,9 @@ from dt_viz.robot.urdf import ArmError
 
 
 def description_of(name: str, others: str) -> tuple[Path, list[Path]]:
-    """Return the URDF of an arm that the package knows and has downloaded, and folders of its meshes.
+    """Return the URDF of an arm, such as "gen3", that the package knows and has downloaded, and folders of its meshes.
 
-    Args:
-        name: such as "gen3".
-        others: names that are accepted, too, for the message.
+    The message of an error says that the `others` are accepted, too.
 
     Raises:
         ArmError: There is no such arm, it is not downloaded, or has no URDF.

@@ -8,18 +8,14 @@ robot's base frame.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
+from dt_viz.flows.fields import Array
 from dt_viz.flows.rotations import apart, rotation
 from dt_viz.kernels.tracking import Postures, settle, walk
 from dt_viz.robot.robot import Robot
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
-    from dt_viz.flows.fields import Array
 
 
 class UnreachableError(ValueError):
@@ -235,17 +231,10 @@ def track(
 
 
 def drawn_onto(robot: Robot, q: Array, positions: Array, reference: Array, orientations: Array | None = None) -> Array:
-    """Correct postures by small motions so that the end effector is at given positions.
+    """Correct postures q (N, n), rad, by small motions so that the end effector is at nearby positions (N, 3), metres.
 
-    Args:
-        robot: the arm.
-        q: (N, n) postures a few millimetres off, rad.
-        positions: (N, 3) desired positions of the end effector, metres.
-        reference: (n,) as in `track`, rad.
-        orientations: (N, 4) as in `track`, wxyz.
-
-    Returns:
-        (N, n) rad, inside the limits; for a position out of reach a posture near it.
+    The reference (n,) and the orientations (N, 4) are as in `track`. Postures stay inside the limits; for a position
+    out of reach they are near it.
     """
     settings, turns = robot.sized_tracking, orientations is not None
     posture = _near(robot, reference[None], settings.first_orientation_weight if turns else None)

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from dt_viz.flows.fields import Array
 from dt_viz.kernels.arm import JOINT, chains, places
 from dt_viz.robot.meshes import constant
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
-    from dt_viz.flows.fields import Array
 
 T = TypeVar("T", bound="Kinematics")
 REFERENCE_REACH = 0.9851132221222917
@@ -143,28 +140,15 @@ class Kinematics:
         return _quaternions(rotations.reshape(-1, 3, 3)).reshape(*rotations.shape[:-2], 4)
 
     def jacobian(self, q: ArrayLike) -> Array:
-        """Compute the linear Jacobian of the end effector in the base frame.
-
-        Args:
-            q: (*B, n) joint angles, rad.
-
-        Returns:
-            (*B, 3, n), metres per rad: ẋ = J q̇.
-        """
+        """Compute the linear Jacobian J (*B, 3, n) of the end effector in the base frame, ẋ = J q̇; q (*B, n), rad."""
         q = np.asarray(q, dtype=float)
         chain = self.chain(q.reshape(-1, q.shape[-1]).T)
         return chain.position_jacobian().transpose(2, 1, 0).reshape(*q.shape[:-1], 3, q.shape[-1])
 
     def joint_frames(self, q: ArrayLike) -> Array:
-        """Compute the rotation of each joint's frame in the previous one, for a viewer's scene tree.
+        """Compute the rotation of each joint's frame in the previous one, (*B, n, 4), wxyz, for a viewer's scene tree.
 
-        The positions of these frames do not depend on q.
-
-        Args:
-            q: (*B, n) joint angles, rad.
-
-        Returns:
-            (*B, n, 4) unit quaternions, wxyz.
+        The positions of these frames do not depend on the angles q (*B, n), rad.
         """
         q = np.asarray(q, dtype=float)
         w, x, y, z = _quaternions(self.joint_rotations).T

@@ -14,19 +14,16 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from functools import cached_property, lru_cache
 from itertools import combinations
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import coal
 import numpy as np
 
+from dt_viz.flows.fields import Array, Indices
 from dt_viz.obstacles.shapes import Box, Cylinder, Obstacle, Sphere, rotation
 from dt_viz.obstacles.triangles import grid_nodes, inside_of_grid, surface_samples
 from dt_viz.robot.kinematics import Kinematics
 from dt_viz.robot.meshes import LinkMesh, cells
-
-if TYPE_CHECKING:
-    from dt_viz.flows.fields import Array, Indices
-
 
 TOLERANCE = 1e-4
 """Largest excess of a reported smallest distance from a ball or the table, metres."""

@@ -12,24 +12,21 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
 import trimesh
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from dt_viz.errors import FormatError
+from dt_viz.flows.fields import Array, Indices
 from dt_viz.robot.kinematics import Kinematics
 from dt_viz.robot.meshes import LinkMesh, VisualMesh, constant
 from dt_viz.robot.tool_chain import ArmChain
 from dt_viz.robot.urdf import Description
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from dt_viz.flows.fields import Array, Indices
 
 SHAPES = ("box", "cylinder", "sphere", "mesh")
 COLOURED = (".dae", ".obj", ".glb", ".gltf", ".ply")
@@ -49,12 +46,7 @@ class Reduced(NamedTuple):
 
 
 def reduced(description: Description, chain: ArmChain, package_dirs: Sequence[Path]) -> Reduced:
-    """Reduce a URDF to a chain: its links with all that is fixed to them.
-
-    Args:
-        description: of the robot.
-        chain: the joints that move.
-        package_dirs: folders in which `package://` addresses resolve.
+    """Reduce a URDF to a chain, its links with all that is fixed to them; meshes are looked for in the folders, too.
 
     Raises:
         FormatError: A mesh is missing, or a shape is of another kind.

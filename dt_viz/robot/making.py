@@ -25,11 +25,9 @@ _one_arm = threading.Lock()
 
 
 def load_aside(name: str, progress: Progress) -> Robot:
-    """Load an arm; one that is new is made in a process of its own, with low priority.
+    """Load an arm as `load_arm`; one that is new is made in a process of its own, with low priority.
 
-    Args:
-        name: as of `load_arm`.
-        progress: as of `load_arm`; it is also called without news, and may raise an exception to cancel.
+    `progress` is also called without news, and may raise an exception to cancel.
 
     Raises:
         ArmError: There is no such arm, or its description cannot be used.

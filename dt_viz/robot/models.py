@@ -6,11 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from dt_viz.errors import naming
+from dt_viz.flows.fields import Array
 from dt_viz.folders import default_cache_folder
 from dt_viz.kernels.arm import BODY_POINT
 from dt_viz.memo import Memo
@@ -37,11 +38,6 @@ from dt_viz.robot.robot import Robot
 from dt_viz.robot.tool_chain import ArmChain, find_chain
 from dt_viz.robot.urdf import ArmError, read_description, read_semantic
 from dt_viz.shipped import ASSETS
-
-if TYPE_CHECKING:
-    from xml.etree.ElementTree import Element
-
-    from dt_viz.flows.fields import Array
 
 DISTRIBUTION = "example-robot-data"
 HOME = (0.0, 3.2, 1.1, 0.0, 3.4, 0.0)

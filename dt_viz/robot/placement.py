@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dt_viz.flows.fields import Array
 from dt_viz.robot.inverse_kinematics import UnreachableError, best_start, inverse_kinematics, track
-
-if TYPE_CHECKING:
-    from dt_viz.flows.fields import Array
-    from dt_viz.robot.robot import Robot
+from dt_viz.robot.robot import Robot
 
 REFERENCE_SHOULDER = (0.0, 0.0, 0.28)
 """Place of the JACO's shoulder, metres, which tasks were made for."""

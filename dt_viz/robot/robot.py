@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from dt_viz.flows.fields import Array, Indices
 from dt_viz.kernels.blocks import MOST_JOINTS
 from dt_viz.kernels.proximity import least_contacts
 from dt_viz.kernels.tracking import TrackingArm
@@ -19,11 +20,6 @@ from dt_viz.robot.link_distances import page_names
 from dt_viz.robot.meshes import LinkMesh, VisualMesh, constant
 from dt_viz.robot.sizing import sized
 from dt_viz.robot.tracking_settings import TrackingSettings
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from dt_viz.flows.fields import Array, Indices
 
 LEAST_JOINTS = 3
 """Smallest number of joints of an arm whose hand can be taken anywhere."""
@@ -143,11 +139,7 @@ class Robot(Kinematics):
         return float(1.2 * self.levers @ self.velocity_limits)
 
     def pairs(self, between: int) -> Indices:
-        """Pairs (K, 2) of body points, by their own spheres, that may not touch.
-
-        Args:
-            between: smallest number of joints between them.
-        """
+        """Pairs (K, 2) of body points, by their own spheres, that may not touch, with so many joints between them."""
         points, joint_of = self.body, {mesh.name: mesh.joint for mesh in self.meshes}
         may_touch = np.zeros((self.num_joints + 1, self.num_joints + 1), bool)  # the last one is the base, −1
         for first, second in self.touching:

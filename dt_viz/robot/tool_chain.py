@@ -4,19 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from dt_viz.errors import FormatError
+from dt_viz.flows.fields import Array
 from dt_viz.kernels.blocks import MOST_JOINTS
 from dt_viz.robot.robot import LEAST_JOINTS
 from dt_viz.robot.urdf import TURNING, Description, Joint, listed, numbers
-
-if TYPE_CHECKING:
-    from xml.etree.ElementTree import Element
-
-    from dt_viz.flows.fields import Array
 
 GRIPPER = ("finger", "gripper", "jaw", "knuckle", "thumb")
 """Words in the names of joints and links at the end of a chain that are a gripper's."""

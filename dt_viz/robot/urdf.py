@@ -7,19 +7,15 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
 from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 from xml.parsers import expat
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dt_viz.errors import DataError, FormatError, naming
-
-if TYPE_CHECKING:
-    from xml.etree.ElementTree import Element
-
-    from dt_viz.flows.fields import Array
+from dt_viz.flows.fields import Array
 
 MAX_BYTES = 20_000_000
 """Size of the largest URDF that is read, bytes."""

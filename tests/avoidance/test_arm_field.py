@@ -30,6 +30,8 @@ from dt_viz.obstacles.shapes import Box, Sphere
 from dt_viz.robot.models import HOME
 
 seeds = st.integers(0, 2**32 - 1)
+STEP = 1e-5
+"""Of differences, rad."""
 ESCAPES = {name: field for name, field in ARM_FIELDS.items() if isinstance(field, WholeArmField)}
 
 
@@ -56,35 +58,31 @@ def occupancy(field, points, depth):
 
 
 class TestFields:
-    def test_beyond_its_reach_nothing_moves_and_value_and_derivative_fade_towards_there(self, field):
+    def test_beyond_its_reach_nothing_moves_and_the_field_fades_towards_there(self, field):
         q = near_ready(2400, spread=0.6)
         distance = clearance(field, q)
         beyond = distance >= field.reach
         assert 20 < beyond.sum() < 2380
-        velocity, DV = field.with_jacobian(q[beyond])
-        np.testing.assert_array_equal(velocity, 0)
-        np.testing.assert_array_equal(DV, 0)
+        np.testing.assert_array_equal(field(q[beyond]), 0)
         assert np.abs(field(q[distance < 0.5 * field.reach])).max(axis=1).min() > 0
         outskirts = q[(distance > 0.97 * field.reach) & (distance < field.reach)]
         assert len(outskirts) > 2
-        for faint, anywhere in zip(field.with_jacobian(outskirts), field.with_jacobian(q), strict=True):
-            assert np.abs(faint).max() < 0.05 * np.abs(anywhere).max()
+        for function in (field, lambda q: central_differences(field, q, STEP)):
+            assert np.abs(function(outskirts)).max() < 0.05 * np.abs(function(q)).max()
 
     def test_a_body_point_on_the_middle_of_the_obstacle_is_nothing_special(self, field):
         q = near_ready(8, seed=3)
         x, y, z = BODY.positions(ROBOT, q)[0, 20]
         there = replace(field, obstacles=(Sphere((x, y, z), 0.15),))
-        velocity, DV = there.with_jacobian(q)
-        assert np.isfinite(there(q)).all() and np.isfinite(velocity).all() and np.isfinite(DV).all()
+        assert np.isfinite(there(q)).all() and np.isfinite(central_differences(there, q, STEP)).all()
 
 
 class TestWholeArmField:
     def test_pinned_postures_stay(self, escape):
         pinned = replace(escape, pins=near_ready(5))
         assert np.abs(escape(near_ready(5))).max() > 0.01
-        velocity, DV = pinned.with_jacobian(near_ready(5))
-        np.testing.assert_array_equal(velocity, 0)
-        np.testing.assert_allclose(DV, 0, rtol=0, atol=1e-13)
+        np.testing.assert_array_equal(pinned(near_ready(5)), 0)
+        np.testing.assert_allclose(central_differences(pinned, near_ready(5), STEP), 0, rtol=0, atol=1e-13)
 
     def test_the_contact_escapes(self, escape):
         """The average contact, moved against V, moves along its own way out."""
@@ -171,16 +169,6 @@ class TestFlows:
 
     def pace(self, field):
         return 1.0 if isinstance(field, WholeArmField) else 0.05
-
-    def test_they_go_on_from_where_they_were_and_squeeze_space(self, field):
-        q, flow = near_ready(12), partial(self.chain, field)
-        in_two = flow(0.2).inverse(flow(0.3).inverse(q))
-        np.testing.assert_allclose(flow(0.5).inverse(q), in_two, rtol=0, atol=1e-7)
-        image, J = flow(0.5).inverse_jacobian(q)
-        assert np.abs(image - q).max() > 0.03
-        np.testing.assert_allclose(flow(0.5).forward(flow(0.5).inverse(q)), q, rtol=0, atol=1e-7)
-        det = np.linalg.det(J)
-        assert det.min() > 0 and np.abs(det - 1).max() > 0.1
 
     def test_the_equal_steps_of_a_drag_come_near_the_adaptive_ones(self, field):
         q, fine = near_ready(12), self.chain(field, 0.4).inverse(near_ready(12))

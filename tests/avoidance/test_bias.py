@@ -22,9 +22,6 @@ from dt_viz.scenario.tasks import DRAWING_AXES, POTS
 from dt_viz.warning import Kind
 
 seeds = st.integers(0, 2**32 - 1)
-
-
-SWEPT = ("draw_s", "push_box")
 PLANE = as_point(DRAWING_AXES[:, 0]), as_point(DRAWING_AXES[:, 1])
 
 
@@ -253,18 +250,6 @@ def test_two_bias_points_in_either_order(nominal, task, order):
     assert_sound(g, solution)
 
 
-@pytest.mark.parametrize("order", [1, -1])
-def test_fig_4_a_letter_biased_to_two_points_in_either_order(nominal, order):
-    g = nominal("draw_j")
-    path = resample_by_arc_length(np.mean([resample_by_arc_length(p, 201) for p in g.bundle.paths], axis=0), 101)
-    places = (path[30] + [-0.10, 0.0, 0.0], path[70] + [0.0, 0.0, -0.08])  # into the letter, below its bow
-    points = [BiasPoint(as_point(place), plane=PLANE) for place in places][::order]
-    solution = biased(g, *points)
-    assert satisfied(solution)
-    assert max(missed(g, solution, point) for point in points) <= ACCEPTED
-    assert_sound(g, solution)
-
-
 @pytest.mark.parametrize("pot", [POTS[0], pytest.param(POTS[2], marks=pytest.mark.slow)])
 def test_fig_8_the_object_falls_into_the_chosen_pot(nominal, pot):
     g = nominal("drop_pots")
@@ -295,10 +280,7 @@ def test_bias_and_avoidance_in_either_order(nominal, level):
 
 @pytest.mark.parametrize(
     ("radius", "words"),
-    [
-        (0.08, "Bias 1: the region of 8 cm is too small: a motion is 12 cm from the target"),
-        (0.123, "fades out"),
-    ],
+    [(0.08, "Bias 1: the region of 8 cm is too small: a motion is 12 cm from the target"), (0.123, "fades out")],
 )
 def test_a_region_that_does_not_reach_the_motion_or_hardly_is_said_to(radius, words):
     built = BiasPoint((0.0, 0.0, 0.0), radius).build(straight(0.12))

@@ -13,11 +13,7 @@ from plans import joints_of
 
 from dt_viz.baselines import linear, mpnet, mpnet_rrt
 from dt_viz.baselines.base import NotFittedError
-from dt_viz.baselines.mpnet import (
-    ARCHITECTURE,
-    Network,
-    Search,
-)
+from dt_viz.baselines.mpnet import ARCHITECTURE, Network, Search
 from dt_viz.baselines.mpnet_training import SETTINGS, initial, loss_and_gradient, steps, train
 from dt_viz.baselines.postures import PlanningScene
 from dt_viz.baselines.registry import METHODS

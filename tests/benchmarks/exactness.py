@@ -312,9 +312,5 @@ class _Clocked:
         velocity = np.linalg.solve(J, self._system.base.velocity(z)[..., None])[..., 0]
         return np.concatenate([s[:, -1:] * velocity, np.zeros((len(s), 1))], axis=1)
 
-    def with_jacobian(self, s: Array) -> tuple[Array, Array]:
-        """No tangents are carried along such motions."""
-        raise NotImplementedError
-
 
 PARTS = {"rollouts": rollouts, "velocity": velocity, "starts": starts}

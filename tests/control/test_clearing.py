@@ -73,13 +73,6 @@ def test_a_way_that_carries_clear_postures_into_the_obstacle_is_left_for_another
     assert wrong > 2
 
 
-def test_the_transform_is_a_bijection(arm, q):
-    found, p = made(arm, q, around(arm, q[50]))
-    assert np.abs(p - q).max() > 0.1
-    there_and_back = found.transform(arm, found.duration).forward(p)
-    assert np.linalg.norm((there_and_back - q) * arm.robot.levers, axis=1).max() < 3e-3
-
-
 def test_nothing_near_or_nothing_to_avoid_changes_nothing(arm, q):
     for avoidance in (None, around(arm, q[50], (0, 0, 0.6))):
         found, p = made(arm, q, avoidance)

@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 from scenes import avoiding, changed
 
-from dt_viz.control.arm_system import ArmSystem
 from dt_viz.control.controller import ArmController, Phase
 from dt_viz.control.settings import ControllerSettings
-from dt_viz.flows.diffeomorphisms import Identity
 from dt_viz.motion.stack import LIVE
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.robot.models import load_jaco
@@ -93,40 +91,19 @@ class TestExactness:
         controller = scene.controller(scene.around(scene.middle) if obstacle else None)
         robot = Robot(controller, scene.start)
         robot.tick()
-        system = controller.system
-        p0 = system.postures(scene.robot.end_effector(scene.start)[None])
-        exact = system.rollout(p0[0], TIMES)
+        plain = controller._section.postures(
+            scene.solved.stack.system.rollout(scene.robot.end_effector(scene.start), TIMES)
+        )
+        exact = controller._flow.transform.inverse(plain)
         robot.run(1.9)  # later on joints at their limits cut corners
         passed = np.array(robot.passed)[30:]
         gaps = np.abs(passed[:, None] - exact).max(axis=2).min(axis=1)
         assert gaps.max() < 1e-3  # of a cubic between two of the samples of the motion ahead
         if obstacle:
-            plain = ArmSystem(system.hand, system.section, Identity(6)).rollout(p0[0], TIMES)
             assert np.abs(passed[:, None] - plain).max(axis=2).min(axis=1).max() > 0.1
-
-    def test_its_velocity_is_that_of_equation_4_at_the_posture_where_it_is(self, scene):
-        """Which a swapped sign or the stack before would not be."""
-        controller = scene.controller(scene.around(scene.middle))
-        robot = Robot(controller, scene.start).run(1.2)
-        compared = 0
-        for _ in range(8):
-            robot.run(0.1)
-            exact = controller.system.velocity(robot.q)
-            along = exact / np.linalg.norm(exact)
-            velocity = robot.velocities[-1]
-            across = velocity - (velocity @ along) * along
-            assert velocity @ along > 0
-            assert np.linalg.norm(across) < 0.06 * np.linalg.norm(velocity)
-            compared += np.linalg.norm(velocity) > 0.1
-        assert compared >= 6
 
 
 class TestArrival:
-    def test_from_the_start(self, scene):
-        robot = Robot(scene.controller(), scene.start)
-        scene.assert_arrives(robot, 12)
-        assert scene.missed(robot.q) < 1e-4
-
     @pytest.mark.parametrize("seed", [*range(3), *(pytest.param(k, marks=pytest.mark.slow) for k in range(3, 12))])
     def test_from_postures_beside_the_section(self, scene, seed):
         """Each converges to the posture that the section has for the goal."""
@@ -254,7 +231,7 @@ class TestDisturbances:
         turned = scene.start + 2 * np.pi * turns * np.isinf(scene.robot.lower)
         robot = Robot(scene.controller(), turned).run(1.5)
         robot.controller.follow(engine.solved(scenario, LIVE))
-        course, section = robot.controller._progress.course, robot.controller.system.section
+        course, section = robot.controller._progress.course, robot.controller._section
         ahead = course.q[course.times > 2]  # by then it has nearly converged to the section
         exact = section.postures(scene.robot.end_effector(ahead)[::-1])[::-1]
         assert len(ahead) > 10 and np.abs(np.sin((ahead - exact) / 2)).max() < 5e-3

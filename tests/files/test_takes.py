@@ -29,12 +29,7 @@ from recorded import (
 
 from dt_viz.files.columns import role_of
 from dt_viz.files.takes import READERS
-from dt_viz.learning.demonstrations import (
-    Demonstration,
-    DemonstrationError,
-    load_demonstrations,
-    save_demonstrations,
-)
+from dt_viz.learning.demonstrations import Demonstration, DemonstrationError, load_demonstrations, save_demonstrations
 
 RNG = np.random.default_rng(1)
 
@@ -556,11 +551,7 @@ def test_a_gripper_beside_joint_angles_says_nothing_of_their_unit(tmp_path):
             "a.json",
             "take 2: found no places",
         ),
-        (
-            table(("t", "x_mm", "y_mm", "z_cm"), [TIMES, path_of()]),
-            "a.csv",
-            "several units of one length",
-        ),
+        (table(("t", "x_mm", "y_mm", "z_cm"), [TIMES, path_of()]), "a.csv", "several units of one length"),
         (b"t,x,y,z\n0,0.1,0.2,\n1,0.2,0.3,0.4\n2,0.3,0.4,0.5\n", "a.csv", "line 2"),
     ],
     ids=["a short row", "two units", "an empty cell"],

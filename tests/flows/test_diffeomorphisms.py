@@ -4,14 +4,7 @@ import numpy as np
 import pytest
 from laws.registry import EXACT, PLANE, bent, uniform
 
-from dt_viz.flows.diffeomorphisms import (
-    Chain,
-    Conjugated,
-    Flow,
-    Identity,
-    min_det_jacobian,
-    round_trip_error,
-)
+from dt_viz.flows.diffeomorphisms import Chain, Conjugated, Flow, Identity, min_det_jacobian, round_trip_error
 from dt_viz.flows.integrators import EULER, IMPLICIT_EULER, RK4
 
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dt_viz.flows.fields import GaussianGrid, GridRBF, PlacedField, Sum
+from dt_viz.flows.fields import GaussianGrid, GridRBF, PlacedField
 
 seeds = st.integers(0, 2**32 - 1)
 dims = st.sampled_from([2, 3])
@@ -49,16 +49,6 @@ def test_a_covering_grid_covers_its_points_no_coarser_than_asked(seed, dim, sigm
         assert np.diff(axis).max() <= spacing * sigma * (1 + 1e-6)
 
 
-@given(seeds, dims)
-def test_the_gram_matrix_is_a_kernel_matrix(seed, dim):
-    rng = np.random.default_rng(seed)
-    grid = random_grid(rng, dim)
-    K = grid.features(grid.inducing_points)
-    np.testing.assert_allclose(K, K.T, rtol=0, atol=1e-14)
-    np.testing.assert_allclose(np.diag(K), 1, rtol=0, atol=1e-14)
-    assert np.linalg.eigvalsh(K).min() > -1e-12
-
-
 def test_weights_of_another_shape_are_refused():
     grid = random_grid(np.random.default_rng(0), 2)
     with pytest.raises(ValueError, match=r"weights have shape \(12, 3\); the grid needs \(12, 2\)"):
@@ -77,18 +67,3 @@ def test_a_placed_field_is_the_field_of_the_moved_turned_and_scaled_thing(seed, 
     (found, J), (_, own) = placed.with_jacobian(world), inner.with_jacobian(u)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-11 * scale)
     np.testing.assert_allclose(J, np.stack([R @ DV @ R.T for DV in own]), rtol=0, atol=1e-11)
-
-
-@given(seeds, dims, st.integers(1, 4))
-def test_a_sum_is_that_of_its_parts(seed, dim, num):
-    rng = np.random.default_rng(seed)
-    s = rng.uniform(-1, 1, (9, dim))
-    parts = tuple(
-        PlacedField(random_field(rng, dim), rng.normal(size=dim), rng.uniform(0.2, 2) * random_rotation(rng, dim))
-        for _ in range(num)
-    )
-    values, derivatives = zip(*(part.with_jacobian(s) for part in parts), strict=True)
-    value, derivative = Sum(parts).with_jacobian(s)
-    np.testing.assert_allclose(Sum(parts)(s), sum(values), rtol=0, atol=1e-12)
-    np.testing.assert_allclose(value, sum(values), rtol=0, atol=1e-12)
-    np.testing.assert_allclose(derivative, sum(derivatives), rtol=0, atol=1e-12)

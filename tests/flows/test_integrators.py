@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from laws.registry import bent
-from oracles import central_differences
 from scipy.integrate import solve_ivp
 
 from dt_viz.flows.fields import GaussianGrid, GridRBF
@@ -13,7 +12,6 @@ from dt_viz.flows.integrators import DORMAND_PRINCE, EULER, IMPLICIT_EULER, RK4,
 from dt_viz.obstacles.shapes import Sphere
 
 seeds = st.integers(0, 2**32 - 1)
-STEPS = [EULER, IMPLICIT_EULER, RK4]
 
 
 def tangents(*arguments):
@@ -45,27 +43,6 @@ def test_points_and_tangents_converge_with_the_order_of_the_step(step, order):
     for values, reference in zip(zip(*found, strict=True), references, strict=True):
         errors = [np.linalg.norm(value - reference) for value in values]
         assert np.polyfit(np.log(counts), -np.log(errors), 1)[0] == pytest.approx(order, abs=0.2)
-
-
-@given(seeds, st.sampled_from([2, 3]), st.floats(0.01, 0.15))
-def test_implicit_euler_inverts_euler_to_rounding(seed, dim, h):
-    rng = np.random.default_rng(seed)
-    field, s = bent(dim, seed), rng.uniform(-1.5, 1.5, (12, dim))
-    for first, second in ((EULER, IMPLICIT_EULER), (IMPLICIT_EULER, EULER)):
-        there, _ = carried(field, s, None, first, -h)
-        np.testing.assert_allclose(carried(field, there, None, second, h)[0], s, rtol=0, atol=1e-13)
-
-
-@given(seeds, st.sampled_from(STEPS), st.floats(-0.15, 0.15))
-def test_tangents_are_the_derivative_of_the_numerical_step(seed, step, h):
-    rng = np.random.default_rng(seed)
-    field, s = bent(2, seed), rng.uniform(-1, 1, (5, 2))
-    U = rng.normal(size=(5, 2, 3))
-    end, V = carried(field, s, U, step, h)
-    assert V is not None
-    np.testing.assert_allclose(end, carried(field, s, None, step, h)[0], rtol=0, atol=1e-13)
-    slope = central_differences(lambda points: carried(field, points, None, step, h)[0], s, 1e-4)
-    np.testing.assert_allclose(V, slope @ U, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("duration", [0.7, -0.7])
@@ -110,19 +87,6 @@ def test_adaptive_points_do_not_depend_on_their_batch(seed, duration):
     together = adaptively(field, s, duration, 1e-7)
     alone = np.concatenate([adaptively(field, point[None], duration, 1e-7) for point in s])
     np.testing.assert_allclose(together, alone, rtol=0, atol=1e-12)
-
-
-@settings(max_examples=8)
-@given(seeds)
-def test_adaptive_tangents_are_the_derivative_of_the_flow(seed):
-    rng = np.random.default_rng(seed)
-    field, s = bent(2, seed, 0.8), rng.uniform(-1, 1, (5, 2))
-    U = rng.normal(size=(5, 2, 2))
-    end, V = carried(field, s, U, DORMAND_PRINCE, 0.8, 1000, 1e-11)
-    fine_end, fine = carried(field, s, U, RK4, 0.8, 150)
-    assert V is not None and fine is not None
-    np.testing.assert_allclose(end, fine_end, rtol=0, atol=1e-7)
-    np.testing.assert_allclose(V, fine, rtol=0, atol=2e-3 * np.abs(fine).max())
 
 
 def test_adaptive_takes_no_points_and_no_time_and_leaves_its_arguments_alone():
@@ -179,9 +143,6 @@ class Plain:
 
     def __call__(self, s):
         return self.inner(s)
-
-    def with_jacobian(self, s):
-        raise NotImplementedError
 
 
 @pytest.mark.parametrize("method", [EULER, RK4, DORMAND_PRINCE])

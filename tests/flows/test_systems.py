@@ -7,13 +7,8 @@ from hypothesis import strategies as st
 from laws.registry import bent
 from oracles import central_differences
 
-from dt_viz.avoidance.bias import BiasPoint
-from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain, Flow
-from dt_viz.flows.fields import GaussianGrid, GridRBF
-from dt_viz.flows.integrators import EULER, IMPLICIT_EULER, RK4
+from dt_viz.flows.diffeomorphisms import Flow
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem, asinh_exp, log_sinh
-from dt_viz.obstacles.shapes import Sphere
-from dt_viz.obstacles.union import Union
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -63,44 +58,6 @@ def test_logarithmic_hyperbolic_functions_are_inverse(a):
     assert asinh_exp(log_sinh(np.array(a))) == pytest.approx(a, rel=1e-12)
     assert asinh_exp(log_sinh(np.array(3e3 * a))) == pytest.approx(3e3 * a, rel=1e-12)  # where sinh overflows, too
     assert (log_sinh(np.array(0.0)), asinh_exp(np.array(-np.inf))) == (-np.inf, 0)
-
-
-def around_a_sphere(tolerance=2e-9):
-    """Imitation-like flow with a sphere's avoidance and a bias point's pull on top, and places all around them."""
-    rng = np.random.default_rng(9)
-    grid = GaussianGrid(tuple(np.linspace(-0.3, 0.3, 5) for _ in range(3)), 0.5 / 0.1**2)
-    learned = GridRBF(grid, 0.03 * rng.normal(size=(grid.num_points, 3)))
-    sphere = Sphere((0.02, 0.03, -0.01), 0.15)
-    pulled = BiasPoint((-0.1, 0.05, 0.02)).field(0.12)
-    chain = Chain(
-        [
-            Flow(learned, 1.0, 4, IMPLICIT_EULER, EULER),
-            AdaptiveFlow(Union((sphere,)).field("free-space", 3.0), 0.4, tolerance),
-            Flow(pulled, 0.8, 32, RK4),
-        ]
-    )
-    y = rng.uniform(-0.2, 0.2, (40, 3))
-    return DiffeomorphicSystem(chain, Attractor(np.array([0.25, 0.1, 0.0]))), y[sphere.signed_distance(y) > 0.01]
-
-
-def test_the_velocity_beside_obstacles_and_bias_points_is_the_derivative_of_exact_rollouts():
-    system, y = around_a_sphere()
-    h = 2e-4
-    z = system.transform.forward(y)
-    f = system.base.velocity(z)[:, None]
-    far, near = (
-        np.diff(system.transform.inverse(z[:, None] + np.array([[-step], [step]]) * f), axis=1)[:, 0] / (2 * step)
-        for step in (2 * h, h)
-    )
-    velocity = system.velocity(y)
-    speed = np.linalg.norm(velocity, axis=1, keepdims=True)
-    assert np.abs((velocity - (4 * near - far) / 3) / speed).max() < 1e-4
-
-
-def test_the_velocity_at_one_point_is_that_in_a_batch():
-    system, y = around_a_sphere()
-    alone = np.stack([system.velocity(point) for point in y])
-    np.testing.assert_allclose(alone, system.velocity(y), rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("batch", [(), (0,), (1,), (2, 3)])

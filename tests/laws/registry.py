@@ -19,15 +19,7 @@ from dt_viz.avoidance.sideways import Sideways
 from dt_viz.avoidance.transform import Transform
 from dt_viz.baselines.eflow import Coupling, Normalisation
 from dt_viz.flows.augmented_systems import OnPlaces, PhaseCurve, PhasedAttractor, Shear, Translation
-from dt_viz.flows.diffeomorphisms import (
-    AdaptiveFlow,
-    Chain,
-    Conjugated,
-    Diffeomorphism,
-    Flow,
-    Identity,
-    Placed,
-)
+from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain, Conjugated, Diffeomorphism, Flow, Identity, Placed
 from dt_viz.flows.fields import GaussianGrid, GridRBF, PlacedField, Projected, Sum, VectorField
 from dt_viz.flows.integrators import EULER, IMPLICIT_EULER
 from dt_viz.flows.systems import Attractor
@@ -254,10 +246,6 @@ class Generator:
     """Largest error of its derivative against differences, relative to the largest derivative."""
 
 
-def around_hand(num: int) -> np.ndarray:
-    return np.asarray(HAND.position) + uniform(3, 0.12)(num)
-
-
 def sideways() -> Sideways:
     rng = np.random.default_rng(0)
     ends, radii = rng.uniform(-0.5, 0.5, (3, 3)), np.array([0.2, 0.3, 0.1])
@@ -290,15 +278,13 @@ FIELDS: dict[str, Generator] = {
     ),
     "shift": Generator(Shift(np.array([0.6, 0.0, 0.8]), 3), uniform(3, 0.7), 1e-4, 1e-6),
     "sideways": Generator(sideways(), uniform(3, 0.5)),
-    "escape of the hand": Generator(WholeArmField(ROBOT, BODY, (HAND,), UP[None], PINS, REACH), near_ready, 1e-5, 1e-5),
-    "escape of the elbow": Generator(
-        WholeArmField(ROBOT, BODY, (ELBOW,), UP[None], PINS, REACH), near_ready, 1e-5, 1e-5
-    ),
+    "escape of the hand": Generator(WholeArmField(ROBOT, BODY, (HAND,), UP[None], PINS, REACH), near_ready),
+    "escape of the elbow": Generator(WholeArmField(ROBOT, BODY, (ELBOW,), UP[None], PINS, REACH), near_ready),
     "escape from a small ball": Generator(
-        WholeArmField(ROBOT, BODY, (beside_hand(0.01, diameter=0.04),), UP[None], PINS, REACH), near_ready, 1e-5, 1e-5
+        WholeArmField(ROBOT, BODY, (beside_hand(0.01, diameter=0.04),), UP[None], PINS, REACH), near_ready
     ),
-    "gradient at the hand": Generator(GradientField(ROBOT, BODY, (HAND,), REACH), near_ready, 1e-5, 1e-5),
-    "gradient at the elbow": Generator(GradientField(ROBOT, BODY, (ELBOW,), REACH), near_ready, 1e-5, 1e-5),
+    "gradient at the hand": Generator(GradientField(ROBOT, BODY, (HAND,), REACH), near_ready),
+    "gradient at the elbow": Generator(GradientField(ROBOT, BODY, (ELBOW,), REACH), near_ready),
 }
 ARM_FIELDS = {name: case.field for name, case in FIELDS.items() if isinstance(case.field, ArmField)}
 

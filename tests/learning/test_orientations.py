@@ -70,14 +70,6 @@ class TestRotations:
 
 
 class TestSystem:
-    def test_the_shear_undoes_itself_and_has_determinant_1(self, imitation):
-        psi, state = imitation.poses.system.transform, states(imitation)
-        image, J = psi.jacobian(state)
-        np.testing.assert_allclose(psi.inverse(image), state, atol=1e-14)
-        np.testing.assert_allclose(np.linalg.det(J), 1.0, atol=1e-10)
-        half = psi.scaled(0.5)  # a one-parameter group
-        np.testing.assert_allclose(half.forward(half.forward(state)), image, atol=1e-14)
-
     def test_its_jacobian_is_that_of_finite_differences(self, imitation):
         psi, state, h = imitation.poses.system.transform, states(imitation, 8), 1e-6
         J = psi.jacobian(state)[1]

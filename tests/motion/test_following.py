@@ -10,7 +10,7 @@ from dt_viz.avoidance.arm_solver import LONG
 from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.avoidance.lift import NUM_CONFIGURATIONS
 from dt_viz.avoidance.start_status import StartStatus
-from dt_viz.control.arm_system import Section
+from dt_viz.control.section import Section
 from dt_viz.errors import UnwantedError
 from dt_viz.motion.following import MAX_TRACKING_ERROR, NUM_ARM_SAMPLES, Follower
 from dt_viz.motion.solve import solve

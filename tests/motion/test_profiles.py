@@ -9,12 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scenes import changed, frame_at
 
-from dt_viz.metrics import (
-    discrete_frechet,
-    distance_from_path,
-    maximum_collision_distance,
-    resample_by_arc_length,
-)
+from dt_viz.metrics import discrete_frechet, distance_from_path, maximum_collision_distance, resample_by_arc_length
 from dt_viz.motion import profiles as profiles_module
 from dt_viz.motion.profiles import NUM_SAMPLES
 from dt_viz.robot.models import load_jaco

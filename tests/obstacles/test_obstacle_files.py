@@ -30,7 +30,6 @@ def exported(mesh: trimesh.Trimesh, kind: str) -> bytes:
     return content.encode() if isinstance(content, str) else bytes(content)  # pyright: ignore[reportArgumentType]
 
 
-BOX_STL = exported(BOX, "stl")
 MANY = exported(trimesh.Trimesh(BOX.vertices, np.resize(BOX.faces, (MAX_FACES + 1, 3)), process=False), "ply")
 """More triangles than a mesh may have."""
 

@@ -6,7 +6,8 @@ from scenes import avoiding, biases, changed, frame_at
 
 from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.avoidance.hand import Avoidance
-from dt_viz.control.arm_system import ArmSystem, Section
+from dt_viz.control.section import Section
+from dt_viz.flows.augmented_systems import frozen
 from dt_viz.flows.diffeomorphisms import Identity
 from dt_viz.motion.stack import FINE
 from dt_viz.obstacles.shapes import Sphere, as_point
@@ -40,10 +41,10 @@ def test_arrows_are_the_hand_s_velocities_of_the_pulled_back_system(scene):
     reference = engine.follower.reference(solved.nominal)
     lattice = Lattice.of(below.points[::37], robot, reference)
     found = lattice.carried(below.velocities[::37], solved.arm.transform, robot, Union(()))
-    system = ArmSystem(solved.stack.system, Section(robot, reference), solved.arm.transform)
-    p = system.transform.inverse(lattice.postures)
-    step = 1e-5
-    hand = [robot.end_effector(p + sign * step * system.velocity(p)) for sign in (1, -1)]
+    p, step = solved.arm.transform.inverse(lattice.postures), 1e-5
+    x = robot.end_effector(lattice.postures)
+    ways = step * np.array([1, -1])[:, None, None] * solved.stack.system.velocity(x)
+    hand = robot.end_effector(solved.arm.transform.inverse(Section(robot, reference).postures(x + ways)))
     expected = (hand[0] - hand[1]) / (2 * step)
     np.testing.assert_allclose(found.points, robot.end_effector(p), atol=1e-6)
     speed = np.linalg.norm(expected, axis=1)
@@ -83,6 +84,6 @@ def test_velocities_are_those_of_the_whole_stack_whether_it_moves_a_place_or_not
     alone = system_of(frame, 0).velocity(places)
     found = velocities(frame, alone)
     free, expected = np.isfinite(found[:, 0]), np.full_like(found, np.nan)
-    expected[free] = frame.motion.stack.at_phase(rest(frame)).velocity(places[free])
+    expected[free] = frozen(frame.motion.stack.system, rest(frame)).velocity(places[free])
     np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-8)
     assert 0.02 < (np.abs(found - alone)[free].max(axis=1) > 1e-4).mean() < 0.98

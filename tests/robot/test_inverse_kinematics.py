@@ -196,16 +196,6 @@ class TestSharedReference:
         q = track(robot, paths, starts, reference=robot.home).q
         np.testing.assert_allclose(q[0, 120], q[1, 60], atol=STEPS)
 
-    def test_a_common_goal_is_a_common_configuration(self, robot):
-        goal = np.array([0.1, -0.5, 0.3])
-        corners = np.random.default_rng(0).uniform(*BOX, size=(8, 3))
-        paths = np.linspace(corners, np.broadcast_to(goal, corners.shape), 100, axis=1)
-        starts = np.stack([inverse_kinematics(robot, path[0]) for path in paths])
-        q = track(robot, paths, starts, reference=robot.home).q
-        np.testing.assert_allclose(q[:, -1], np.broadcast_to(q[0, -1], (8, 6)), atol=STEPS)
-        own = track(robot, paths, starts).q
-        assert np.ptp(own[:, -1], axis=0).max() > 0.1  # without it they differ
-
     def test_the_start_is_the_default(self, robot):
         path = smooth_path(0)
         start = inverse_kinematics(robot, path[0])

@@ -6,7 +6,6 @@
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 from typing import Literal
 
 import coal  # noqa: TID251, here it is the oracle
@@ -24,6 +23,7 @@ from dt_viz.learning.store import FitStore
 from dt_viz.motion.stack import LIVE
 from dt_viz.robot import models
 from dt_viz.robot.arm_cache import from_arrays, to_arrays
+from dt_viz.robot.body_points import PROTRUSION
 from dt_viz.robot.choices import ArmSearchSettings, Ranges, find_touching, semantic_homes
 from dt_viz.robot.collision import CollisionModel
 from dt_viz.robot.cover import CoverSettings, cover, protrusion
@@ -39,9 +39,8 @@ from dt_viz.session.engine import Engine
 from dt_viz.session.tasks_in_reach import in_reach
 
 QUICK = ("so100", "xarm7")
-each_arm = pytest.mark.parametrize(
-    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in ARMS if name != "jaco"]
-)
+OTHERS = [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in ARMS if name != "jaco"]
+each_arm = pytest.mark.parametrize("name", OTHERS)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -76,13 +75,15 @@ def beyond(robot: Robot, mesh) -> float:
     return float(away.min(axis=1).max())
 
 
-@each_arm
+@pytest.mark.parametrize("name", ["jaco", *OTHERS])
 def test_spheres_hold_the_links_and_stick_out_by_little(name):
     robot = load_arm(name)
     assert max(beyond(robot, mesh) for mesh in robot.meshes) <= 1e-6
-    mean, most = protrusion(robot.body.spheres, robot.meshes)
-    assert mean < 5e-3 and most < 0.03
-    assert f"{1e3 * mean:.1f} mm in the mean" in robot.report()
+    mean, most = protrusion(robot.body.spheres, robot.meshes, 1e-3 if name == "jaco" else 2e-3)
+    if name == "jaco":
+        assert mean < 3.5e-3 and most < PROTRUSION + 4e-4 and len(robot.body.joint) == 29
+    else:
+        assert mean < 5e-3 and most < 0.03 and f"{1e3 * mean:.1f} mm in the mean" in robot.report()
     wide = robot.body.spheres.copy()
     wide["radius"] += 3e-3
     assert protrusion(wide, robot.meshes)[0] > mean + 2e-3
@@ -326,50 +327,6 @@ def test_names_that_nobody_knows_are_told(monkeypatch):
     monkeypatch.setitem(sys.modules, "robot_descriptions", None)
     with pytest.raises(ArmError, match=r"found 'nobody'; accepted: jaco, panda, .*pip install robot_descriptions"):
         load_arm("nobody")
-
-
-REPOSITORIES = """
-class Repository:
-    def __init__(self, path): self.cache_path = path
-REPOSITORIES = {name: Repository(name) for name in ("small", "away")}
-"""
-CACHE = """
-import os
-def clone_to_cache(name, commit=None): raise AssertionError("downloaded")
-"""
-DESCRIPTION = """
-from ._cache import clone_to_cache as _clone_to_cache
-REPOSITORY_PATH = _clone_to_cache("NAME", commit=None)
-URDF_PATH = REPOSITORY_PATH + "/arm.urdf"
-"""
-
-
-@pytest.fixture
-def descriptions(tmp_path, monkeypatch):
-    """A package robot_descriptions whose files are not all there, and that would download them."""
-    folder, package = tmp_path / "robot_descriptions", ModuleType("robot_descriptions")
-    package.__path__ = [str(folder)]
-    files = {"_repositories.py": REPOSITORIES, "_cache.py": CACHE, "macro_description.py": "XACRO_PATH = 'x'"}
-    files |= {f"{name}_description.py": DESCRIPTION.replace("NAME", name) for name in ("small", "away")}
-    folder.mkdir()
-    for name, text in files.items():
-        write(folder, text, name)
-    (tmp_path / "files" / "small").mkdir(parents=True)
-    write(tmp_path / "files" / "small", urdf(4, shape=BALL))
-    monkeypatch.setenv("ROBOT_DESCRIPTIONS_CACHE", str(tmp_path / "files"))
-    monkeypatch.setitem(sys.modules, "robot_descriptions", package)
-    yield
-    for name in [name for name in sys.modules if name.startswith("robot_descriptions.")]:
-        del sys.modules[name]
-
-
-def test_arms_of_robot_descriptions_are_loaded_but_never_downloaded(descriptions, tmp_path, monkeypatch):
-    forget(monkeypatch, tmp_path)
-    robot = load_arm("small")
-    assert (robot.name, robot.num_joints) == ("small", 4)
-    for name, words in (("away", "robot_descriptions pull away"), ("macro", "xacro"), ("nothing", "found 'nothing'")):
-        with pytest.raises(ArmError, match=words):
-            load_arm(name)
 
 
 def hollow(sides: int) -> LinkMesh:

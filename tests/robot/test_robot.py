@@ -9,10 +9,7 @@ import numpy as np
 import pinocchio as pin  # noqa: TID251, here it is the oracle
 import pytest
 import yourdfpy
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
-from pinocchio_arm import pinocchio_configuration, pinocchio_model, placed_vertices, random_configurations
+from pinocchio_arm import placed_vertices, random_configurations
 
 from dt_viz.robot.models import load_jaco, urdf_path
 
@@ -43,10 +40,7 @@ class TestModel:
 
     @pytest.mark.parametrize(
         ("package", "words"),
-        [
-            ("no-such-robot-data", "pip install no-such-robot-data"),
-            ("numpy", r"numpy .* holds no .*kinova\.urdf"),
-        ],
+        [("no-such-robot-data", "pip install no-such-robot-data"), ("numpy", r"numpy .* holds no .*kinova\.urdf")],
     )
     def test_what_is_missing_is_named(self, monkeypatch, package, words):
         monkeypatch.setattr("dt_viz.robot.models.DISTRIBUTION", package)
@@ -55,19 +49,6 @@ class TestModel:
 
 
 class TestKinematics:
-    @given(q=arrays(np.float64, (6,), elements=st.floats(-2 * np.pi, 2 * np.pi)))
-    def test_places_and_their_derivatives_are_those_of_pinocchio(self, q):
-        robot, (model, data, *_) = load_jaco(), pinocchio_model()
-        hand, turned = model.getFrameId("j2s6s200_end_effector"), pinocchio_configuration(q)
-        expected = pin.computeFrameJacobian(model, data, turned, hand, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
-        np.testing.assert_allclose(robot.jacobian(q), expected[:3], atol=1e-12)
-        pin.framesForwardKinematics(model, data, turned)
-        rotations, origins = robot.forward_kinematics(q)
-        for i in range(robot.num_joints):
-            np.testing.assert_allclose(rotations[i], data.oMi[i + 1].rotation, atol=1e-12)
-            np.testing.assert_allclose(origins[i], data.oMi[i + 1].translation, atol=1e-12)
-        np.testing.assert_allclose(robot.end_effector(q), data.oMf[hand].translation, atol=1e-12)
-
     def test_batch_axes_lead(self, robot):
         q = random_configurations(robot, 0, (2, 3))
         rotations, origins = robot.forward_kinematics(q)

@@ -319,7 +319,7 @@ REPOSITORIES = {name: Repository(name) for name in ("small", "away")}
 """
 DESCRIPTION = """
 from ._cache import clone_to_cache
-URDF_PATH = clone_to_cache("small", commit=None) + "/FILE"
+URDF_PATH = clone_to_cache("FOLDER", commit=None) + "/FILE"
 """
 BALL = '<geometry><sphere radius="0.06"/></geometry>'
 
@@ -331,7 +331,10 @@ def descriptions(tmp_path, monkeypatch):
     folder.mkdir(parents=True)
     files = {"__init__.py": "", "_cache.py": "def clone_to_cache(name, commit=None): raise AssertionError"}
     files |= {"_descriptions.py": DESCRIPTIONS, "_repositories.py": REPOSITORIES}
-    files |= {f"{name}_description.py": DESCRIPTION.replace("FILE", f"{name}.urdf") for name in ("small", "bad")}
+    files["macro_description.py"] = "XACRO_PATH = 'x'"
+    for name, there in (("small", "small"), ("bad", "small"), ("away", "away")):
+        text = DESCRIPTION.replace("FOLDER", there).replace("FILE", f"{name}.urdf")
+        files[f"{name}_description.py"] = text
     (tmp_path / "files" / "small").mkdir(parents=True)
     write(tmp_path / "files" / "small", urdf(4, shape=BALL), "small.urdf")
     write(tmp_path / "files" / "small", "<robot", "bad.urdf")
@@ -358,6 +361,13 @@ class TestMaking:
         assert {fraction for fraction, _ in told} > {0.0, 1.0}
         monkeypatch.setattr(making, "_make", lambda *_: pytest.fail("made again"))
         assert making.load_aside("small", lambda *_: None) is small
+
+    @pytest.mark.parametrize(
+        ("name", "words"), [("away", "descriptions pull away"), ("macro", "xacro"), ("nothing", "found 'nothing'")]
+    )
+    def test_what_is_not_there_is_never_downloaded(self, descriptions, name, words):
+        with pytest.raises(ArmError, match=words):
+            load_arm(name)
 
     def test_what_it_refuses_is_one_line(self, descriptions):
         with pytest.raises(ArmError, match=r"bad\.urdf: .*accepted: "):

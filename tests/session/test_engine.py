@@ -13,7 +13,6 @@ import dt_viz.session.engine as engine_module
 from dt_viz.avoidance.bias import MAX_TARGET_MISS, BiasPoint
 from dt_viz.errors import UnwantedError, never
 from dt_viz.flows import rollouts
-from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.metrics import distance_from_path, maximum_collision_distance
 from dt_viz.motion import diagnostics
 from dt_viz.obstacles.shapes import Sphere, as_point
@@ -154,13 +153,6 @@ def test_without_avoidance_the_rollouts_are_the_ghost(engine, scenario):
             if frame.stage <= Stage.LIVE:
                 np.testing.assert_allclose(path, ghost, rtol=0, atol=1e-12)
             assert distance_from_path(ghost, path).max() < 1e-12
-
-
-def test_with_an_obstacle_far_away_nothing_changes(engine, scenario):
-    frame = frame_at(engine, placed(scenario, (3.0, 3.0, 3.0)), Stage.LIVE)
-    assert set(frame.durations.values()) == {0}
-    for path, ghost in zip(frame.rollouts, frame.ghost, strict=True):
-        np.testing.assert_allclose(path, ghost, rtol=0, atol=1e-12)
 
 
 def test_without_imitation_motions_are_straight(engine, scenario):
@@ -373,30 +365,6 @@ def test_the_same_scenario_gives_the_same_frame_whatever_was_shown_before(new_en
     np.testing.assert_array_equal(a.pictures.field.velocities, b.pictures.field.velocities)
     assert (a.certificates, a.durations) == (b.certificates, b.durations)
     assert (a.arm is None) == (b.arm is None)
-
-
-@pytest.mark.parametrize("task", TASK_NAMES)
-@pytest.mark.parametrize("num", [500, pytest.param(10_000, marks=pytest.mark.slow)])
-def test_random_starts_around_the_demonstrations_all_reach_the_goal(engine, fits, task, num):
-    task = engine.task(task)
-    imitation = fits.get(task.demonstrations)
-    points = np.concatenate([d.positions for d in task.demonstrations])
-    lower, upper = points.min(axis=0), points.max(axis=0)
-    grow = (upper - lower) / 4  # by half its size in all
-    starts = np.random.default_rng(0).uniform(lower - grow, upper + grow, (num, len(lower)))
-    duration = max(d.times[-1] for d in task.demonstrations)
-    motion = imitation.system.rollout(starts, duration * np.array([0.0, 0.2, 0.5, 0.8, 1.0, 20.0]))
-    np.testing.assert_allclose(motion[:, 0], starts, rtol=0, atol=1e-9)
-    values = imitation.system.lyapunov(motion[:, :5])
-    arrived = values[:, :-1] < 1e-12 * values.max()  # what is below is rounding
-    assert (arrived | (np.diff(values, axis=-1) < 0)).all()
-    assert task.scale * np.linalg.norm(motion[:, -1] - imitation.goal, axis=1).max() < 1e-4
-    assert np.linalg.det(imitation.transform.jacobian(motion)[1]).min() > 0
-
-
-def test_a_task_is_loaded_once(engine):
-    assert engine.task("draw_s") is engine.task("draw_s")
-    assert all(isinstance(d, Demonstration) for d in engine.task("draw_s").demonstrations)
 
 
 @pytest.mark.parametrize("space", ["task", "cspace"])

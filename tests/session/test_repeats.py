@@ -47,10 +47,7 @@ def random_scenario(seed):
     size = float(rng.uniform(0.05, 0.18))
     obstacle = (Sphere((x, y, z), size), Box((x, y, z), (size, 0.7 * size, size)), Cylinder((x, y, z), size, 2 * size))
     return avoiding(
-        name,
-        (obstacle[rng.integers(3)],),
-        space=("task", "cspace")[rng.integers(2)],
-        imitation=bool(rng.integers(4)),
+        name, (obstacle[rng.integers(3)],), space=("task", "cspace")[rng.integers(2)], imitation=bool(rng.integers(4))
     )
 
 
