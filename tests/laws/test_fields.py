@@ -37,14 +37,13 @@ def _case(request):
 @pytest.mark.parametrize("name", [name for name, case in FIELDS.items() if isinstance(case.field, PointField)])
 def test_the_derivative_is_that_of_its_values(name):
     case = FIELDS[name]
-    s = case.points(40)
-    value, DV = case.field.with_jacobian(s)
+    s, field = case.points(40), case.field
+    assert isinstance(field, PointField)
+    value, DV = field.with_jacobian(s)
     scale = np.abs(DV).max()
     assert scale > 0.1
-    np.testing.assert_allclose(value, case.field(s), rtol=0, atol=1e-12 * scale)
-    np.testing.assert_allclose(
-        DV, central_differences(case.field, s, case.step), rtol=0, atol=case.exact * max(1, scale)
-    )
+    np.testing.assert_allclose(value, field(s), rtol=0, atol=1e-12 * scale)
+    np.testing.assert_allclose(DV, central_differences(field, s, case.step), rtol=0, atol=case.exact * max(1, scale))
 
 
 def test_each_point_is_on_its_own(case):
