@@ -164,7 +164,7 @@ class Share:
     def counts(self) -> np.void:
         """Sums of the `COUNTS` of all processes."""
         counts = self._board.rows["counts"]
-        return np.array([tuple(counts[name].sum(axis=0) for name in counts.dtype.names)], COUNTS)[0]
+        return np.array([tuple(counts[name].sum(axis=0) for name in COUNTS.names or ())], COUNTS)[0]
 
     def refused(self) -> None:
         """Count a request that is refused."""

@@ -13,11 +13,12 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Callable, Coroutine, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO
 from itertools import count, pairwise
+from typing import Any
 from zipfile import ZipFile
 
 import numpy as np
@@ -168,7 +169,7 @@ class Other:
             self.num_done += 1
 
 
-DOINGS: Mapping[str, Callable[[Other], Awaitable[None]]] = {
+DOINGS: Mapping[str, Callable[[Other], Coroutine[Any, Any, None]]] = {
     "learns": Other.learn,
     "uploads": Other.upload,
     "drags": Other.drag,

@@ -44,6 +44,10 @@ NUM_PLACES, MAX_WAITING = 2, 8
 class Client(ProtocolClient):
     """A visitor who may be sent away."""
 
+    async def __aenter__(self):
+        await super().__aenter__()
+        return self
+
     async def is_lost(self) -> bool:
         """Whether the server closes the connection."""
         try:
