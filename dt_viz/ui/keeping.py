@@ -131,10 +131,16 @@ class Keeper:
         return True
 
     def _ask_again(self, session: Session, resume: Callable[[Saved], None]) -> None:
+        first = session.scenario
+
+        def stopped() -> bool:
+            """Whether something was edited, or the visitor has left; moving the camera is no edit."""
+            return session.jobs.closed or session.scenario != first
+
         told, attempts = False, ATTEMPTS
-        while attempts and not told and not session.jobs.superseded(LANE):
+        while attempts and not told and not stopped():
             told, attempts = self._ask(), attempts - 1
-        if self.begun is not None and session.jobs.superseded(LANE):  # it was edited, or the visitor has left
+        if self.begun is not None and stopped():
             self.begun = None
         elif self.begun is not None:
             resume(self.begun)

@@ -249,6 +249,7 @@ def test_the_page_opens_before_a_slow_browser_has_told_and_goes_on_with_it_when_
     browser = Slow(**{KEY: made()})
     page = opened(browser)
     assert page.session.scenario.task == "draw_s" and message(page) == keeping.SLOW
+    page.visitor._keeper.changed()  # the camera was moved, or reports from where it looks
     browser.answers = True
     wait_until(lambda: page.session.scenario == MADE)
     settled(page)
