@@ -35,7 +35,7 @@ def start_module(
 def stand_back() -> None:
     """Let the server, and so its visitors, go before this process where processors are busy."""
     with suppress(AttributeError, OSError):  # not on Windows
-        os.nice(10)
+        os.nice(5)
 
 
 def end_session(process: subprocess.Popen) -> None:

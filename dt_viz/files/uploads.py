@@ -23,7 +23,7 @@ from dt_viz.files.values import unpacked
 T = TypeVar("T")
 START = 60.0
 """Longest time until a process is ready for a file, seconds; a busy machine takes ten to import what it needs."""
-PATIENCE = 60.0
+PATIENCE = 20.0
 """Longest time for a file from then on, seconds; see `dt_viz.files.worker.limit` for its processor time."""
 
 
