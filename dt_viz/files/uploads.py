@@ -91,7 +91,7 @@ class _Process:
             UnwantedError: nobody wants it any more.
         """
         deadline = time.monotonic() + patience
-        while len(lines := self._said.read_text().splitlines()) < self._num_lines:
+        while len(lines := self._said.read_text().split("\n")[:-1]) < self._num_lines:  # those that have ended
             if self.has_ended:
                 raise _ended(self._process.returncode)
             end_if(cancelled)

@@ -1,4 +1,4 @@
-"""Who computes when: what follows a hand comes before what refines, and that before who has overdrawn his account."""
+"""Who computes when: what follows a hand comes before what refines, and in both who owes least comes first."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from enum import IntEnum, auto
 from typing import NamedTuple
 
 from dt_viz.accounts import settle
@@ -27,39 +26,31 @@ class CoresSettings:
     """Longest time for which who has overdrawn gives way at once: he goes on, if slowly."""
 
 
-class Rank(IntEnum):
-    """Ranks of what is computed, the first one first."""
-
-    HAND = auto()
-    """What follows a hand."""
-    REFINEMENT = auto()
-    OVERDRAWN = auto()
-    """Both, of a thread whose account is overdrawn."""
-
-
 class _Place(NamedTuple):
-    """A place in the queue; those of the smallest rank, debt and number come first."""
+    """A place in the queue; the smallest comes first."""
 
-    rank: Rank
+    refines: bool
+    """Whether it refines, and so follows no hand."""
     debt: float
-    """Debt of the account on arrival, seconds."""
+    """Debt of the account on arrival, seconds; 0 if it is not overdrawn."""
     number: int
     """A number that grows with each arrival."""
     thread: int
 
 
 class Cores:
-    """A bounded semaphore with ranks; see `Rank`.
+    """A bounded semaphore with priorities.
 
-    Among equals who has waited longest gets a slot first, but of those who have overdrawn, who owes least. One slot is
-    for hands only, unless there is only one slot: a hand waits for other hands alone. Nobody waits for a slot within a
-    slot, nor within a `functools.cached_property`: Python 3.10 and 3.11 lock it for all instances.
+    Those who follow a hand get a slot before those who refine; among equals who owes least, and of these who has waited
+    longest. One slot is never a refinement's, unless there is only one: a hand waits for other hands alone. Nobody
+    waits for a slot within a slot, nor within a `functools.cached_property`: Python 3.10 and 3.11 lock it for all
+    instances.
     """
 
     def __init__(self, num: int = os.cpu_count() or 1, settings: CoresSettings = CoresSettings()) -> None:
         """Allow `num` computations at once."""
         self._changed, self._settings = threading.Condition(), settings
-        self._free, self._free_for = num, {True: settings.num_hands, False: max(1, num - 1)}
+        self._free, self._free_for = num, {False: settings.num_hands, True: max(1, num - 1)}
         self._numbers = itertools.count()
         self.queue: list[_Place] = []
         """Those who wait; the smallest is next."""
@@ -78,16 +69,14 @@ class Cores:
         """
         end_if(cancelled or never)
         debt = settle()
-        rank = Rank.OVERDRAWN if debt else Rank.HAND if cancelled is None else Rank.REFINEMENT
         with self._changed:
-            place = _Place(rank, debt, next(self._numbers), threading.get_ident())
+            place = _Place(cancelled is not None, debt, next(self._numbers), threading.get_ident())
             self.queue.append(place)
             try:
-                while not self._changed.wait_for(
-                    lambda: self._is_next(place), self._settings.look if cancelled else None
-                ):
+                look = self._settings.look if place.refines else None
+                while not self._changed.wait_for(lambda: self._is_next(place), look):
                     end_if(cancelled or never)
-                self._take(rank, 1)
+                self._take(place, 1)
                 self._held.append(place)
             finally:
                 self.queue.remove(place)
@@ -97,7 +86,7 @@ class Cores:
         finally:
             settle()
             with self._changed:
-                self._take(rank, -1)
+                self._take(place, -1)
                 self._held.remove(place)
                 self._changed.notify_all()
 
@@ -113,7 +102,7 @@ class Cores:
 
             def is_last() -> bool:
                 others = [place for place in (*self._held, *self.queue) if place.thread != own]
-                return all(place[:2] >= (Rank.OVERDRAWN, debt) for place in others)
+                return all(place.debt >= debt for place in others)
 
             self._changed.wait_for(is_last, self._settings.longest)
 
@@ -126,9 +115,9 @@ class Cores:
 
         return asked
 
-    def _take(self, rank: Rank, num: int) -> None:
+    def _take(self, place: _Place, num: int) -> None:
         self._free -= num
-        self._free_for[rank is Rank.HAND] -= num
+        self._free_for[place.refines] -= num
 
     def _is_next(self, place: _Place) -> bool:
-        return place == min(self.queue) and self._free > 0 and self._free_for[place.rank is Rank.HAND] > 0
+        return place == min(self.queue) and self._free > 0 and self._free_for[place.refines] > 0

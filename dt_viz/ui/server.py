@@ -83,11 +83,8 @@ class Server:
             GateError: this version of viser is not supported.
         """
         listening = listening or listen(host, port)
-        accounts, titles, arms = (
-            Accounts(),
-            {name: entry.title for name, entry in tasks.items()},
-            ArmStore(tasks, fits, robot),
-        )
+        titles, arms = {name: entry.title for name, entry in tasks.items()}, ArmStore(tasks, fits, robot)
+        accounts = Accounts()
         self._new_visitor: Callable[[viser.ClientHandle], Visitor] = lambda client: Visitor(
             client, arms.engine(), robot, titles, task, arms, self._share, accounts.opened(self.gate.address(client))
         )

@@ -3,8 +3,9 @@
     python -m tests.benchmarks capacity --visitors 1000 100000 --out capacity.json
 
 A visitor is as in the lecture of `evaluate load`: some drag in bursts, all others look on. What a picture and a visitor
-cost is measured there, and given by options. A process computes on one core, one picture after the other, for each who
-drags in turn, so that an edit is answered after a random part of a round, and a picture.
+cost is measured by `evaluate load --visitors 1 --seconds 15` and `--rest --visitors 1 8 --processes 1`, and given by
+options, whose defaults are of a shared core; prices are made up. A process computes on one core, one picture after the
+other, for each who drags in turn, so that an edit is answered after a random part of a round, and a picture.
 
 of a process
     largest number of visitors of a process of whose edits a part (`--answered`) is answered in time (`--within`): on
@@ -121,12 +122,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--visitors", type=whole_number(1), nargs="+", default=(1000, 100_000), help="at once")
     for name, default, text in (
         ("picture", 0.042, "time of one core for a picture, seconds"),
-        ("looking", 0.02, "part of a core for each who looks on"),
+        ("looking", 0.1, "part of a core for each who looks on"),
         ("dragging", 0.083, "part of the visitors who drag at a moment"),
         ("answered", 0.95, "part of the edits that are answered in time"),
         ("within", 0.5, "that time, seconds"),
         ("kilobytes", 60.0, "size of a picture, kB"),
-        ("process", 250.0, "memory of a process, MB"),
+        ("process", 380.0, "memory of a process, MB"),
         ("visitor", 20.0, "memory of a visitor, MB"),
         ("core-price", 10.0, "price of a core and its memory for a month, €"),
         ("gigabyte-price", 0.02, "price of a GB that is sent, €"),

@@ -153,6 +153,27 @@ def test_what_hangs_is_ended(reader, monkeypatch, begins, words):
     assert time.monotonic() - start < PATIENCE + begins * uploads.START
 
 
+def test_a_line_that_comes_in_pieces_is_one_line(reader):
+    """As where Python is told to buffer nothing (PYTHONUNBUFFERED)."""
+    program = """
+import sys, time
+from pathlib import Path
+from tempfile import gettempdir
+def say(*pieces):
+    for piece in pieces:
+        time.sleep(0.1)
+        print(piece, end="", flush=True)
+say("\\n")
+while sys.stdin.readline():
+    Path(gettempdir(), "answer").write_text('{"refused": ["file", "this", "that"]}')
+    say("0", " ", "0.25", "\\n")
+"""
+    reader(program, begins=False)
+    for _ in range(2):
+        with pytest.raises(FormatError, match="file: found this; accepted: that"):
+            read_upload(Triangles, [("a.stl", BOX)])
+
+
 def test_what_ends_before_it_begins_says_so(reader):
     reader("", begins=False)
     with pytest.raises(FormatError, match="ended its reader"):

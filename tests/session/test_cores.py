@@ -126,29 +126,23 @@ def owing(debt):
 
 
 @pytest.mark.parametrize("crowd", [[1]], indirect=True)
-def test_who_has_overdrawn_comes_after_who_has_not_and_who_owes_least_first(crowd):
+def test_of_hands_and_then_of_refinements_who_owes_least_comes_first(crowd):
     crowd.come("x")
-    crowd.come("b", account=owing(2.0))
-    crowd.come("C", account=owing(1.0))
-    crowd.come("d", account=owing(3.0))
-    crowd.come("E")
-    crowd.come("f", account=Account())
-    crowd.go("x", "f", "E", "C", "b")
-    assert crowd.order == ["x", "f", "E", "C", "b", "d"]
+    for name, debt in zip("bCdEf", (2.0, 1.0, 3.0, 0.0, 0.0), strict=True):
+        crowd.come(name, account=owing(debt))
+    crowd.go("x", "f", "b", "d", "E")
+    assert crowd.order == ["x", "f", "b", "d", "E", "C"]
 
 
 @pytest.mark.parametrize("crowd", [[2, 1]], indirect=True)
-def test_who_has_overdrawn_waits_for_nobody_where_nobody_waits_and_lets_a_hand_be_followed_beside_him(crowd):
-    crowd.come("a", account=owing(5.0))
-    assert crowd.order == ["a"]
-    crowd.come("b")
-    assert crowd.order == ["a", "b"]  # he holds no slot of hands
-    crowd.come("c", account=owing(5.0))
-    crowd.go("b")
-    assert crowd.order == ["a", "b"]  # and one is left for them
+def test_a_hand_waits_for_no_refinement_also_of_who_has_overdrawn(crowd):
+    crowd.come("A")
+    crowd.come("b", account=owing(5.0))
+    assert crowd.order == ["A", "b"]
+    crowd.come("c", account=owing(1.0))
     crowd.come("d")
-    crowd.go("a")
-    assert crowd.order == ["a", "b", "d", "c"]
+    crowd.go("b", "d")
+    assert crowd.order == ["A", "b", "d", "c"]
 
 
 def test_what_is_computed_in_a_slot_is_charged(crowd):
