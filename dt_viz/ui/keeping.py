@@ -14,8 +14,9 @@ from typing import Protocol
 
 from dt_viz.errors import DataError
 from dt_viz.scenario.saved import Known, Saved, ScenarioError, Sight, decode, encode, portable
+from dt_viz.scenario.scenario import Scenario
 from dt_viz.session.frame import Frame, Stage
-from dt_viz.session.session import Session
+from dt_viz.session.session import CHOICES, Session
 from dt_viz.warning import Severity
 
 KEY = "dt-viz"
@@ -30,7 +31,7 @@ SMALL, MAX_KEPT = 100_000, 10**6
 """Numbers of bytes of a text that is quickly sent, and of the largest that is kept."""
 LANE = "keeping"
 """Lane of the session's jobs on which the browser is asked and told."""
-SLOW = "This browser has not told yet what it keeps: the page begins anew, or goes on with it when it comes."
+SLOW = "This browser has not told yet what it keeps: the page goes on with it when it comes, unless you edit before."
 BLOCKED = "This browser keeps nothing: after a reload, the page begins anew."
 FULL = "This browser has no room left to keep what you do: after a reload, the page begins as before."
 OWN_TASK = "Demonstrations as large as yours are not kept in this browser: save the scenario, and open that file again."
@@ -72,20 +73,32 @@ class Keeper:
         """Text that was written last, or that needs no writing."""
         self._proven = False
         """Whether the browser was asked if it keeps what it is told."""
+        self._first: Scenario | None = None
+        """Scenario that the page shows until it goes on with what the browser keeps; None if it does, or need not."""
         self.begun: Saved | None = None
         """What the page begins with, or goes on with; None if it begins anew, or has begun."""
-        self._ask()
+        self._attempts = 0 if self._ask() else ATTEMPTS
+        """Number of times that the browser is still asked; 0 once it has told."""
 
     def begin(self, session: Session, resume: Callable[[Saved], None]) -> None:
-        """Keep what is there, from now on, when it is `changed`; `resume` takes what the browser tells late."""
+        """Keep what is there, from now on, when it is `changed`.
+
+        `resume` goes on with what the browser tells late, or the session has not begun with. Until then only an edit is
+        written in its place, not what the camera reports.
+        """
         trouble = tuple(self._said)
         self._written = self._text()
         for text in trouble:
             session.say(text, Severity.WARNING)
-        if BLOCKED not in trouble:
-            self._session = session
-        if SLOW in trouble:
-            session.jobs.submit(LANE, partial(self._ask_again, session, resume))
+        if BLOCKED in trouble:
+            return
+        self._session, self._resume = session, resume
+        late = None if self.begun is None or self.begun.scenario == session.scenario else self.begun
+        if late is not None or self._attempts:
+            self._first = session.scenario
+        if late is not None:
+            resume(late)
+        self.changed()
 
     def go_on(self, saved: Saved) -> None:
         """Take note of what the page goes on with."""
@@ -106,12 +119,13 @@ class Keeper:
 
     def changed(self) -> None:
         """Keep what is there now, soon. Never blocks for long."""
-        if self._session is not None:
-            self._session.jobs.submit(LANE, partial(self._write, self._session), latest=True)
+        if self._session is not None:  # the newest of these does what those before it would have done
+            self._session.jobs.submit(LANE, partial(self._keep, self._session), latest=True)
 
     def forget(self) -> None:
         """Keep nothing until the next edit."""
         if self._session is not None:
+            self._first = None
             self._session.jobs.submit(LANE, self._remove, latest=True)
 
     def _ask(self) -> bool:
@@ -130,20 +144,25 @@ class Keeper:
             self._say(f"The page begins anew. {error}")
         return True
 
-    def _ask_again(self, session: Session, resume: Callable[[Saved], None]) -> None:
-        first = session.scenario
+    def _waits(self, session: Session) -> bool:
+        """Whether the page has still to go on with what the browser keeps: an edit takes its place."""
+        if session.scenario != self._first:
+            self._first = None
+        return self._first is not None
 
-        def stopped() -> bool:
-            """Whether something was edited, or the visitor has left; moving the camera is no edit."""
-            return session.jobs.closed or session.scenario != first
-
-        told, attempts = False, ATTEMPTS
-        while attempts and not told and not stopped():
-            told, attempts = self._ask(), attempts - 1
-        if self.begun is not None and stopped():
-            self.begun = None
-        elif self.begun is not None:
-            resume(self.begun)
+    def _keep(self, session: Session) -> None:
+        """Ask the browser, until it tells, what it keeps, and go on with that; once that is done, write what is new."""
+        while self._attempts and self._waits(session) and not session.jobs.closed:
+            self._attempts -= 1
+            if self._ask():
+                self._attempts = 0
+                session.jobs.wait_idle(CHOICES)  # a task, scene or file that is chosen meanwhile is an edit, too
+                if self.begun is None or not self._waits(session):
+                    self.begun = self._first = None
+                else:
+                    self._resume(self.begun)
+        if not self._waits(session):
+            self._write(session)
 
     def _write(self, session: Session) -> None:
         text = self._text()

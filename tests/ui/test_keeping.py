@@ -1,5 +1,6 @@
 """What a visitor has made is kept in his browser: the newest, not too often, and whatever that keeps the page opens."""
 
+import threading
 import time
 from dataclasses import replace
 from typing import Any
@@ -19,7 +20,7 @@ from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import TASKS, own_task
 from dt_viz.session.frame import Stage
 from dt_viz.session.session import CHOICES
-from dt_viz.ui import keeping
+from dt_viz.ui import keeping, panel
 from dt_viz.ui.keeping import KEY, LANE, PAUSE
 from dt_viz.ui.scene.camera import view_of
 from dt_viz.ui.tabs.status import verdict
@@ -245,16 +246,86 @@ def test_a_browser_without_room_is_noticed_and_that_is_said_once(opened):
     assert said == [keeping.FULL] and len(browser.told) == 2
 
 
+def look_from_the_top(page: Page) -> None:
+    """Move the camera, as its first report may do, too."""
+    page.visitor._camera.look(TASKS["draw_s"]())
+    page.visitor._camera.view("Top")
+
+
 def test_the_page_opens_before_a_slow_browser_has_told_and_goes_on_with_it_when_it_does(opened):
     browser = Slow(**{KEY: made()})
     page = opened(browser)
     assert page.session.scenario.task == "draw_s" and message(page) == keeping.SLOW
-    page.visitor._keeper.changed()  # the camera was moved, or reports from where it looks
+    look_from_the_top(page)
+    assert browser.told == []
     browser.answers = True
     wait_until(lambda: page.session.scenario == MADE)
     settled(page)
     assert page.session.jobs.wait_idle(CHOICES, PATIENCE)
     assert page.session._screen.progress.restored == MADE
+    assert {decode(text, KNOWN).scenario for _, text in browser.told} <= {MADE}
+
+
+def test_what_a_browser_keeps_is_not_overwritten_before_the_page_goes_on_with_it(opened, monkeypatch):
+    ready, scene = threading.Event(), SCENES["lift"].scenario(TASKS["lift_box"]())
+    monkeypatch.setattr(panel, "check_shapes", lambda _scenario: ready.wait(PATIENCE))
+    browser = Browser(**{KEY: made(scenario=scene)})
+    page = opened(browser)
+    look_from_the_top(page)
+    settled(page)
+    assert page.session.scenario.task == "draw_s" and browser.told == []
+    ready.set()
+    wait_until(lambda: page.session.scenario == scene)
+    look_from_the_top(page)
+    settled(page)
+    assert kept(browser).scenario == scene and kept(browser).camera is not None
+
+
+def test_a_slow_browser_that_keeps_nothing_is_told_where_the_camera_is_once_it_has_answered(opened):
+    browser = Slow()
+    page = opened(browser)
+    browser.answers = True
+    settled(page)
+    look_from_the_top(page)
+    settled(page)
+    assert kept(browser).camera is not None
+
+
+def test_a_browser_that_never_tells_is_given_up_and_told_of_edits_only(opened, monkeypatch):
+    monkeypatch.setattr(keeping, "PATIENCE", 0.01)
+    browser = Slow(**{KEY: made()})
+    page = opened(browser)
+    settled(page)
+    assert browser.asked == 1 + keeping.ATTEMPTS
+    look_from_the_top(page)
+    settled(page)
+    assert browser.told == []
+    page.session.edit("Warp", warp=0.5)
+    settled(page)
+    assert kept(browser).scenario.warp == 0.5
+
+
+def test_what_a_slow_browser_tells_while_a_task_is_chosen_or_after_a_reset_is_not_taken(opened):
+    browser, chosen = Slow(**{KEY: made()}), threading.Event()
+    page = opened(browser)
+
+    def choose(session: Any, _title: str) -> None:
+        assert chosen.wait(PATIENCE)
+        session.choose_task("draw_j")
+
+    page.visitor._panel.begin(choose, page.session, "")
+    browser.answers = True
+    wait_until(lambda: not page.visitor._keeper._attempts)
+    chosen.set()
+    settled(page)
+    assert page.session.scenario.task == "draw_j" and kept(browser).scenario.task == "draw_j"
+    browser = Slow(**{KEY: made()})
+    page = opened(browser)
+    page.claim(page["History"], "Reset")
+    browser.answers = True
+    settled(page)
+    assert page.session.jobs.wait_idle(CHOICES, PATIENCE)
+    assert page.session.scenario.task == "draw_s" and KEY not in browser
 
 
 def test_what_a_slow_browser_tells_after_an_edit_is_not_taken(opened):
