@@ -55,6 +55,9 @@ DROP = """files => {
 }"""
 """Drops files, each a name and a text, on the page."""
 
+STORED = "Object.keys(localStorage).find(key => key.endsWith('dt-viz'))"
+"""Script that finds the name under which the browser keeps what was made on the page."""
+
 page_errors: list[str] = []
 """What pages have complained of in their consoles."""
 OF_OTHERS = ("Unable to preventDefault inside passive event listener", "GPU stall due to ReadPixels")
@@ -119,6 +122,11 @@ def project(page, visitor: Visitor, point) -> tuple[float, float]:
     width, height = page.viewport_size["width"], page.viewport_size["height"]
     focal = height / 2 / np.tan(camera.fov / 2)
     return width / 2 + focal * seen[0] / seen[2], height / 2 + focal * seen[1] / seen[2]
+
+
+def kept(page) -> str | None:
+    """What the browser keeps of what was made on the page; None if it keeps nothing."""
+    return page.evaluate(f"localStorage.getItem({STORED})")
 
 
 def press(locator):

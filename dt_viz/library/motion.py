@@ -33,7 +33,7 @@ from dt_viz.learning.preparation import DemonstrationWarning, prepare
 from dt_viz.learning.state import State, learn
 from dt_viz.library.opened import learned_for
 from dt_viz.library.orientations import along
-from dt_viz.library.places import as_place, in_space
+from dt_viz.library.places import as_place, as_places, in_space
 from dt_viz.library.report import many, missed, orientation_line, sampled, summaries
 from dt_viz.library.takes import Demonstrations, check_goals, demonstrations_of
 from dt_viz.motion.certificates import Certificates, DrawnSamples, certified
@@ -169,7 +169,7 @@ class Motion:
         if starts is None:
             rays = solution.rays if label is None else replace(solution.rays, z0=solution.rays.z0[self.labelled(label)])
         else:
-            states = self._states(self.checked(np.atleast_2d(np.asarray(starts, float)), "starts"), label)
+            states = self._states(as_places(np.atleast_2d(np.asarray(starts, float)), self.dimension, "starts"), label)
             rays = Rays(system.transform.forward(states), system.base)
         evaluate = lambda index, fraction: system.transform.inverse(rays.at(index, fraction))[:, None, :3]  # noqa: E731
         bundle = refined(evenly_sampled(evaluate, len(rays.z0), NUM_SAMPLES), evaluate, spacing)
@@ -197,7 +197,7 @@ class Motion:
                 numbers each.
         """
         points = np.asarray(y, float)
-        self.checked(points.reshape(-1, points.shape[-1] if points.ndim else 1), "y")
+        as_places(points.reshape(-1, points.shape[-1] if points.ndim else 1), self.dimension, "y")
         places, system = self.in_space(points.reshape(-1, self.dimension)), self.solution.system
         if phase is not None or self.state == "plain":
             velocity = frozen(system, self.rest(phase, start, label)).velocity(places)
@@ -257,8 +257,7 @@ class Motion:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the motion to a file (npz, whatever its suffix): what was learned, the demonstrations and the stack.
 
-        A motion that was opened from a scenario is written as one (JSON). A file that is there is replaced, and stays
-        as it is if something fails.
+        One that was opened from a scenario is written as that (JSON). An existing file is only replaced by a whole one.
 
         Raises:
             DataError: a transform is not one of `dt_viz.avoidance.registry.KINDS`, or holds what could not be read.
@@ -315,7 +314,7 @@ class Motion:
         """The states (N, k) along the motion from a start (d,), or along those of the demonstrations with a label."""
         system, rays = self.solution.system, self.solution.rays
         if start is not None:
-            began = self._states(self.checked(np.asarray(start, float)[None], "start"), label)
+            began = self._states(as_places(np.asarray(start, float)[None], self.dimension, "start"), label)
             rays = Rays(system.transform.forward(began), system.base)
         elif label is not None:
             rays = replace(rays, z0=rays.z0[self.labelled(label)])
@@ -326,7 +325,7 @@ class Motion:
     def rest(self, phase: float | None, start: ArrayLike | None, label: float | None) -> Array:
         """Find what the state of a motion from a start (d,) has besides the place, at a phase; None is at its start."""
         began = self._learned.task.starts[0, : self.dimension] if start is None else np.asarray(start, float)
-        rest = self._states(self.checked(began[None], "start"), label)[0, NUM_COORDINATES:]
+        rest = self._states(as_places(began[None], self.dimension, "start"), label)[0, NUM_COORDINATES:]
         if phase is not None:
             check_between("phase", phase, 0.0, 1.0)
             rest[:1] *= phase
@@ -337,15 +336,6 @@ class Motion:
         if label not in self.labels:
             raise unknown_label(label, self.labels)
         return np.flatnonzero(np.array(self.demonstrated_labels) == label)
-
-    def checked(self, places: Array, field: str) -> Array:
-        """Places (N, d) that were given, checked."""
-        if places.ndim != 2 or places.shape[1] != self.dimension or not len(places):
-            shape = "×".join(str(n) for n in places.shape)
-            raise FormatError(field, f"{shape} numbers", f"places of {self.dimension} coordinates, metres")
-        if not np.isfinite(places).all():
-            raise FormatError(field, "a number that is not finite", "finite numbers, metres")
-        return places
 
     def in_space(self, points: Array) -> Array:
         """Points (N, 3) of points (N, d)."""
@@ -377,8 +367,8 @@ def fit(
             too, and learns the hand's orientation where all takes have it. "auto" is that then; else plain where a fit
             with the default settings misses no demonstration by more than 5 % of their extent and, with three or more,
             follows those that are left out about as well as the augmented state.
-        labels: a number for each demonstration, where they differ although they begin at one place: those with one
-            number are of one pattern; makes the state augmented. None finds them where that is so; see `Motion.labels`.
+        labels: a number for each demonstration, its pattern's, where they differ although they begin at one place;
+            makes the state augmented. None finds them where that is so; see `Motion.labels`.
         settings: of the plain fit, the objective included, and of the preparation; None takes the defaults.
         augmented: settings of the augmented state; None takes the defaults, and that preparation.
         rate: samples a second, Hz, of arrays and tables without times; None takes each take as 5 s long.

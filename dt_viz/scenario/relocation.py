@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -16,7 +16,7 @@ from dt_viz.flows.fields import Array, Mask
 from dt_viz.flows.rotations import turned
 from dt_viz.obstacles.shapes import Box, Cylinder, Obstacle, Point, Sphere, as_point, as_quaternion
 from dt_viz.scenario.scenario import MAX_DIAMETER, MIN_DIAMETER, Layer, Scenario, Start
-from dt_viz.scenario.tasks import Task
+from dt_viz.scenario.tasks import OWN, Task
 
 SIZES = ("diameter", "height", "sizes", "scale")
 """Fields of obstacles that are lengths."""
@@ -148,3 +148,15 @@ def relocated(
 
 def _stays(layer: Layer, is_there: Callable[[Point], bool]) -> bool:
     return not isinstance(layer.transform, Anchored) or is_there(layer.transform.position)
+
+
+def changes_of_place(arm: str, before: Task, after: Task, gone: Sequence[str]) -> str:
+    """Return what a visitor is told of `relocated`, for the arm of a title; empty where there is nothing to say."""
+    said = []
+    if after.name.startswith(OWN) and (after.scale, *after.origin) != (before.scale, *before.origin):
+        said.append(
+            f"“{after.title}” is moved to where the {arm} follows it, {after.scale / before.scale:.2g} × as large."
+        )
+    if gone:
+        said.append(f"Out of reach of the {arm}, and left out: {', '.join(gone)}.")
+    return " ".join(said)

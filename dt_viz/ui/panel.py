@@ -215,7 +215,7 @@ class ControlPanel:
         if scene is not None:
             self.begin(self._load, session, scene.title)
         elif link.kind == "task" and link.name in self._titles:
-            self.begin(lambda session, _title: session.choose_task(link.name), session, self._titles[link.name])
+            self.begin(lambda session, _title: session.begin_task(link.name), session, self._titles[link.name])
         else:
             text = f"The link: {link.kind}: found {link.name!r}; accepted: {', '.join(names)}"
             session.say(text, Severity.WARNING)

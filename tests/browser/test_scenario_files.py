@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from browsing import DROP, PATIENCE, close_notices, close_page, open_page, press, take, wait_until
+from browsing import DROP, PATIENCE, close_notices, close_page, kept, open_page, press, take, wait_until
 from chromium import needs_chromium
 
 from dt_viz.scenario.paper_scenes import SCENES
@@ -59,7 +59,7 @@ def test_own_demonstrations_go_with_their_scenario_from_server_to_server_byte_fo
     after = moving(other)
     assert [path.tobytes() for path in before] == [path.tobytes() for path in after]
     assert saved(there) == text
-    wait_until(lambda: other._keeper._written == text, "the browser to keep it")
+    wait_until(lambda: kept(there) == text, "the browser to keep it")
 
     known = set(another.visitors)
     there.reload()
@@ -107,7 +107,7 @@ def test_a_link_begins_what_it_names_and_a_reload_goes_on_with_what_was_made_of_
     first.session.edit("test", warp=0.5)
     address = page.evaluate("location.href")
     assert "scene=" not in address and "task=" not in address and ("other=1" in address) == ("other" in link)
-    wait_until(lambda: first._keeper._written and '"warp":0.5' in first._keeper._written, "the browser to keep it")
+    wait_until(lambda: '"warp":0.5' in (kept(page) or ""), "the browser to keep it")
     known.add(first)
     page.reload()
     second = visitor()

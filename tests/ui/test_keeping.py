@@ -23,7 +23,9 @@ from dt_viz.session.session import CHOICES
 from dt_viz.ui import keeping, panel
 from dt_viz.ui.keeping import KEY, LANE, PAUSE
 from dt_viz.ui.scene.camera import view_of
+from dt_viz.ui.scripts import Link
 from dt_viz.ui.tabs.status import verdict
+from dt_viz.ui.visitor import initial_scenario
 
 PLACE = (0.1, -0.5, 0.4)
 KNOWN = Known(tuple(TITLES))
@@ -426,6 +428,17 @@ def test_scenes_with_a_bottle_come_back_beside_the_event_loop(opened):
     page = opened(Browser(**{KEY: made(scenario=scene)}))
     assert page.session.jobs.wait_idle(CHOICES, PATIENCE)
     assert page.session.scenario == scene and page.session._screen.progress.restored == scene
+
+
+def test_a_link_begins_its_task_afresh_also_where_that_is_what_was_kept_and_undo_brings_it_back(opened):
+    page = opened(Browser(**{KEY: made()}))
+    page.visitor.told(Link("task", MADE.task))
+    assert page.session.jobs.wait_idle(CHOICES, PATIENCE)
+    assert page.session.scenario == initial_scenario(page.session.engine, MADE.task)
+    settled(page)
+    assert kept(page.client.local_storage).scenario == page.session.scenario
+    page.session.undo()
+    assert page.session.scenario.choices == MADE.choices
 
 
 # --- the camera ---
