@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from browsing import DROP, PATIENCE, close_notices, close_page, kept, open_page, press, take, wait_until
+from browsing import DROP, PATIENCE, UNHURRIED, close_notices, close_page, kept, open_page, press, take, wait_until
 from chromium import needs_chromium
 
 from dt_viz.scenario.paper_scenes import SCENES
@@ -21,6 +21,13 @@ def another(fits, robot):
     server = Server(TASKS, fits, robot, task="push_box", port=0, max_sessions=2)
     yield server
     server.close()
+
+
+def new_page(browser):
+    """A tab that has not gone anywhere yet, and draws as seldom as those of `open_page`."""
+    page = browser.new_page(viewport={"width": 720, "height": 450})
+    page.add_init_script(UNHURRIED)
+    return page
 
 
 def saved(page) -> str:
@@ -91,8 +98,7 @@ def test_a_file_that_is_none_is_said_once_and_the_page_goes_on(browser, server):
     ],
 )
 def test_a_link_begins_what_it_names_and_a_reload_goes_on_with_what_was_made_of_it(browser, server, link, shown):
-    known = set(server.visitors)
-    page = browser.new_page()
+    known, page = set(server.visitors), new_page(browser)
     page.goto(f"http://127.0.0.1:{server.port}/{link}")
 
     def visitor():
@@ -116,7 +122,7 @@ def test_a_link_begins_what_it_names_and_a_reload_goes_on_with_what_was_made_of_
 
 
 def test_a_link_to_nothing_says_what_there_is_and_the_page_opens(browser, server):
-    page, known = browser.new_page(), set(server.visitors)
+    page, known = new_page(browser), set(server.visitors)
     page.goto(f"http://127.0.0.1:{server.port}/?scene=%3Cb%3Enothing%3C%2Fb%3E")
     page.get_by_text("The link: scene: found '<b>nothing</b>'").first.wait_for(timeout=1000 * PATIENCE)
     assert page.get_by_text(next(iter(SCENES))).count()
