@@ -163,7 +163,6 @@ class ControlPanel:
         )
 
     def _learn(self, session: Session, task: Task) -> None:
-
         self.begin(lambda session, _title: session.choose_task(self._bring(session, task)), session, task.title)
 
     def _bring(self, session: Session, task: Task, arm: str | None = None) -> str:
