@@ -35,7 +35,7 @@ MAY_IMPORT: Mapping[str, set[str]] = {
     "session": BELOW_SESSION | {"baselines"},
     "baselines": BELOW_SESSION - {"pictures"},
     "serving": set(),
-    "ui": BELOW_SESSION | {"session", "baselines", "serving"},
+    "ui": BELOW_SESSION | {"kernels", "session", "baselines", "serving"},
     "evaluate": BELOW_SESSION | {"session", "baselines"},
     "examples": {"foundation"},
     "cli": BELOW_SESSION | {"session", "serving", "ui", "evaluate", "saving"},

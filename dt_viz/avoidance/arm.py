@@ -24,7 +24,9 @@ from dt_viz.avoidance.passing import ANEW, Passing
 from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.kernels.blocks import room_asked
 from dt_viz.kernels.dodging import Forecast, LimitedArm, dodge
+from dt_viz.kernels.limits import barrier, velocity_bounds
 from dt_viz.kernels.proximity import contacts, least_contacts, proximity
+from dt_viz.kernels.tubes import evenly_bent, tubes
 from dt_viz.obstacles.shapes import Obstacle, Sphere, records
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.inverse_kinematics import track
@@ -50,12 +52,13 @@ class WholeArm:
 
     def compiled(self) -> Iterator[float]:
         """Compile what a drag repeats for this processor, or load what was compiled before; yields the part done."""
-        robot, q, obstacle = self.robot, self.robot.home[None], Sphere((0.0, 0.0, 0.0))
+        robot, q, obstacle = self.robot, self.robot.home[None].copy(), Sphere((0.0, 0.0, 0.0))
         field = WholeArmField(robot, self.body, (obstacle,), np.eye(3)[:1], q[:0], 0.1)
         points = self.body.of_chain(robot.chain(q.T))
         shapes, values = records((obstacle,))
         joints, links, still = robot.records, robot.links.spheres, np.zeros(robot.num_joints)
-        dodging, ones = LimitedArm(joints, links, still, still, still, 1.0), np.ones((1, 1))
+        limits = robot.lower, robot.upper, robot.velocity_limits
+        dodging, ones = LimitedArm(joints, links, *limits, 1.0), np.ones((1, 1))
         forecast = Forecast(shapes, values, np.ones(1), np.ones((1, 1, 3)), ones, 0.0, 0.0, 1.0)
         calls: tuple[Callable[[], object], ...] = (
             lambda: robot.end_effector(q),
@@ -66,6 +69,9 @@ class WholeArm:
             lambda: contacts(joints, links, np.array([[-1, 0]]), q[0].copy(), 1.0),
             lambda: least_contacts(joints, links, np.array([[-1, 0]]), q.copy(), 1.0),
             lambda: dodge(dodging, forecast, still, still, still, still, 0.0),
+            lambda: velocity_bounds(dodging, still, still, 1.0),
+            lambda: barrier(np.ones(1), np.ones((1, robot.num_joints)), 1.0, 1.0),
+            lambda: tubes(evenly_bent(np.eye(3), 3)[None], 1.0, 1.0, 3),
             lambda: escape_directions(points, self.body.radius, np.eye(3)[:1], obstacle, margin=2.0),
             lambda: field(q),
             lambda: obstacle.field("free-space", 1.0)(np.zeros((1, 3))),  # the hand's fields

@@ -9,11 +9,12 @@ import daqp
 import numpy as np
 
 from dt_viz.avoidance.arm import WholeArm
-from dt_viz.control.limits import AccelerationLimit, ContactLimit, ObstacleLimit, RangeLimit, VelocityLimit
+from dt_viz.control.limits import ContactLimit, ObstacleLimit
 from dt_viz.control.obstacle_motion import Sighting
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.flows.fields import Array
 from dt_viz.kernels.dodging import Forecast, LimitedArm, dodge
+from dt_viz.kernels.limits import velocity_bounds
 from dt_viz.obstacles.shapes import records
 
 SOFT = 8
@@ -45,11 +46,6 @@ class FeasibleVelocities:
         """Make the limits of an arm."""
         robot = self._robot = arm.robot
         self._settings = settings
-        self._limits = (
-            RangeLimit(robot, settings.acceleration),
-            VelocityLimit(robot.velocity_limits),
-            AccelerationLimit(settings.acceleration),
-        )
         self._barrier = ObstacleLimit(arm, settings.clearance, settings.barrier_gain, settings.barrier_reach)
         self._contacts = tuple(
             make(robot, settings.clearance, settings.contact_gain) for make in (ContactLimit.table, ContactLimit.itself)
@@ -69,12 +65,10 @@ class FeasibleVelocities:
         The obstacles were seen `late` seconds ago. Before the first tick the robot stands still.
         """
         velocity = np.zeros(len(q)) if before is None else before.velocity
-        lower, upper = np.full(len(q), -np.inf), np.full(len(q), np.inf)
-        for limit in self._limits:  # the last one's bounds, of acceleration, come first
-            lowest, highest = limit.bounds(q, velocity, dt)
-            lower, upper = _within(lower, lowest, highest), _within(upper, lowest, highest)
+        lower, upper = velocity_bounds(self._limited, q, velocity, dt)
         contacts = [limit.rows(q, least, dt) for limit, least in zip(self._contacts, self._kept, strict=True)]
-        there = replace(seen, avoidance=seen.expected(late, 0.0, self._settings.returning))
+        moved = seen.speed > 0  # replacing takes as long as the rows
+        there = replace(seen, avoidance=seen.expected(late, 0.0, self._settings.returning)) if moved else seen
         *barrier, clearance = self._barrier.rows(q, there, dt)
         nearest = _nearest(wanted, lower, upper, [*contacts, barrier])
         previous = None if before is None else before.evasive
@@ -93,10 +87,11 @@ class FeasibleVelocities:
         worth. Choosing anew in each tick, that is model predictive control with one move, by enumeration. A distance
         `floor` from the table, metres, is kept.
         """
-        settings, speeds = self._settings, np.linalg.norm(seen.velocities, axis=1)
-        moving = np.flatnonzero(speeds > settings.slow)
-        if seen.avoidance is None or not len(moving):
+        settings = self._settings
+        if seen.avoidance is None or seen.speed <= settings.slow:
             return None
+        speeds = np.linalg.norm(seen.velocities, axis=1)
+        moving = np.flatnonzero(speeds > settings.slow)
         times = np.linspace(0, settings.horizon, settings.num_ahead + 1)[1:]
         moved = np.stack([seen.motions[k].ahead(times + late, settings.returning) for k in moving], axis=1)
         deviation = np.outer(settings.unsure + settings.doubt * times, speeds[moving])

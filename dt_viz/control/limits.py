@@ -1,4 +1,4 @@
-"""Limits of the joints' velocities, a class of one method each; what they allow is the feasible set of a tick."""
+"""Distances that a tick keeps, as rows of slopes and bounds: with bounds of velocities the feasible set of a tick."""
 
 from __future__ import annotations
 
@@ -9,62 +9,13 @@ import numpy as np
 from dt_viz.avoidance.arm import WholeArm
 from dt_viz.control.obstacle_motion import Sighting
 from dt_viz.flows.fields import Array, Indices
+from dt_viz.kernels.limits import STEADIEST, barrier
 from dt_viz.kernels.proximity import contacts, least_contacts, proximity
 from dt_viz.obstacles.shapes import records
 from dt_viz.robot.robot import Robot
 
-NUM_POINTS = 8
-"""Number of body points, those nearest to what they may not touch, that have a barrier."""
-BRAKING_SHARE = 0.8
-"""Part of the acceleration limit that braking before a joint limit counts on: ticks are not infinitely short."""
-IMMOBILE = 1e-4
-"""Squared slope of a distance, m²/rad², up to which no joint moves the point to speak of."""
-STEADIEST = 0.5
-"""Part of a distance that goes in one tick at most, however long it is."""
 JOINTS_BETWEEN = 3
 """Number of joints between two parts of the arm from which on they can touch: fewer do not fold them that far."""
-
-
-@dataclass(frozen=True)
-class VelocityLimit:
-    """|q̇| ≤ the limit of each joint."""
-
-    limits: Array
-    """(n,) rad/s."""
-
-    def bounds(self, q: Array, velocity: Array, dt: float) -> tuple[Array, Array]:
-        """Lowest and highest velocities (n,), rad/s, in a tick of `dt` seconds after `velocity` (n,) at q (n,)."""
-        return -self.limits, self.limits
-
-
-@dataclass(frozen=True)
-class AccelerationLimit:
-    """|q̈| ≤ the limit of all joints."""
-
-    limit: float
-    """rad/s²."""
-
-    def bounds(self, q: Array, velocity: Array, dt: float) -> tuple[Array, Array]:
-        """See `VelocityLimit`."""
-        return velocity - self.limit * dt, velocity + self.limit * dt
-
-
-@dataclass(frozen=True)
-class RangeLimit:
-    """Joints stay within their range: they are never faster than they can brake."""
-
-    robot: Robot
-    acceleration: float
-    """Limit for all joints, rad/s²."""
-
-    def bounds(self, q: Array, velocity: Array, dt: float) -> tuple[Array, Array]:
-        """See `VelocityLimit`."""
-        return -self._fastest(q - self.robot.lower, dt), self._fastest(self.robot.upper - q, dt)
-
-    def _fastest(self, room: Array, dt: float) -> Array:
-        """Velocities v (n,) towards limits `room` (n,) away after which braking at b suffices: room − v·dt = v²/2b."""
-        b = BRAKING_SHARE * self.acceleration
-        return np.where(room > 0, b * (np.sqrt(dt * dt + 2 * np.maximum(room, 0) / b) - dt), room / dt)
 
 
 @dataclass(frozen=True)
@@ -94,8 +45,8 @@ class ObstacleLimit:
         if not len(distance):
             return slopes, distance, np.inf
         h = distance - min(self.clearance, seen.avoidance.margin / 2)
-        near, bounds = _barrier(h, slopes, self.gain, dt)
-        approach = np.einsum("ki,ki->k", outward[near], seen.velocities[part[near]])
+        near, bounds = barrier(h, slopes, self.gain, dt)
+        approach = (outward[near] * seen.velocities[part[near]]).sum(axis=1)
         return slopes[near], approach + bounds, float(distance.min())
 
 
@@ -136,13 +87,5 @@ class ContactLimit:
         """Slopes s (K, n) and bounds b (K,) with s·q̇ ≥ b at q (n,) where distances (M,) are kept."""
         reach = self.clearance + self.robot.top_speed / min(self.gain, STEADIEST / dt)
         which, apart, slopes = contacts(self.robot.records, self.robot.body.spheres, self.pairs, q, reach)
-        near, bounds = _barrier(apart - kept[which], slopes, self.gain, dt)
+        near, bounds = barrier(apart - kept[which], slopes, self.gain, dt)
         return slopes[near], bounds
-
-
-def _barrier(h: Array, slopes: Array, gain: float, dt: float) -> tuple[Indices, Array]:
-    """Choose the pairs (K,) that are nearest, of those that joints move, and the least rates of their distances h."""
-    near = np.flatnonzero((slopes**2).sum(axis=1) > IMMOBILE)
-    near = near[np.argsort(h[near])[:NUM_POINTS]]
-    # what is too near parts faster than what is apart may approach
-    return near, -min(gain, STEADIEST / dt) * np.where(h[near] > 0, h[near], 2 * h[near])

@@ -74,6 +74,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--processes", type=whole_number(1), help="of the server; its own choice unless given")
     parser.add_argument("--seconds", type=positive_number("seconds", 3600), default=20.0, help="to drag (default: 20)")
+    settled = positive_number("seconds", 3600)
+    parser.add_argument(
+        "--after", type=settled, default=SETTINGS.settled, help="so long on the page (default: %(default)s)"
+    )
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--rest", action="store_true", help="drag nothing: measure what visitors cost who look on")
     what.add_argument("--lecture", action="store_true", help="most look on, some drag in bursts, few change the task")
@@ -93,7 +97,9 @@ def run(options: argparse.Namespace) -> int:
             visits.append(asyncio.run(_visited(options, url, process, task, number)))
     report([_row(figures) for figures in visits])
     if out is not None:
-        settings = {name: getattr(options, name) for name in ("avoid", "seconds", "rest", "lecture", "processes")}
+        settings = {
+            name: getattr(options, name) for name in ("avoid", "seconds", "after", "rest", "lecture", "processes")
+        }
         settings["task"] = task.name
         machine = {"cores": os.cpu_count(), "python": platform.python_version(), "numpy": np.__version__}
         write_json(out, {"unit_ms": unit, "visits": visits, "settings": settings | machine})
@@ -112,7 +118,7 @@ async def _visited(
         figures: dict[str, Any] = {"clients": number, "first_picture_s": firsts, "visitors": []}
         if None in firsts:
             return figures
-        await asyncio.sleep(SETTINGS.settled)
+        await asyncio.sleep(options.after)
         visits, num_edits = [*map(Visit, clients)], max(1, round(SETTINGS.edits_per_second * options.seconds))
         before, num_before = used(process), sum(client.num_messages for client in clients)
         began = time.perf_counter()

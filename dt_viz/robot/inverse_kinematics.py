@@ -297,7 +297,8 @@ def _walk(robot: Robot, paths: Array, starts: Array, posture: Postures, stride: 
     lines = np.concatenate([begin[:, None], paths], axis=1)
     lengths = np.cumsum(np.linalg.norm(np.diff(_along(robot, lines), axis=1), axis=-1), axis=1)
     num_strides = 1 + int(lengths.max() / stride)
-    return walk(robot.tracking_arm, posture, lines, np.insert(lengths, 0, 0.0, axis=1), np.array(starts), num_strides)
+    lines, lengths = (np.array(values, order="C") for values in (lines, np.insert(lengths, 0, 0.0, axis=1)))
+    return walk(robot.tracking_arm, posture, lines, lengths, np.array(starts), num_strides)
 
 
 def _swept(robot: Robot, q: Array, paths: Array, posture: Postures, which: NDArray[np.intp]) -> Array:

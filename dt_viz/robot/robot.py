@@ -133,7 +133,7 @@ class Robot(Kinematics):
         weights = (getattr(self.sized_tracking, name) for name in TrackingArm._fields[5:])
         return TrackingArm(self.records, hand, axis, lower, upper, *weights)
 
-    @property
+    @cached_property
     def top_speed(self) -> float:
         """Largest speed of any point, m/s, each joint at its limit: a fifth more than by levers, which are means."""
         return float(1.2 * self.levers @ self.velocity_limits)

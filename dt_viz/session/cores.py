@@ -20,8 +20,8 @@ class CoresSettings:
 
     num_hands: int = 1
     """Number of hands that are followed at once."""
-    look: float = 0.02
-    """Interval at which what waits and may be cancelled asks whether it is still wanted."""
+    look: float = 0.25
+    """Interval at which what waits and may be cancelled asks whether it is still wanted, unless it is woken before."""
     longest: float = 0.25
     """Longest time for which who has overdrawn gives way at once: he goes on, if slowly."""
 
@@ -36,6 +36,7 @@ class _Place(NamedTuple):
     number: int
     """A number that grows with each arrival."""
     thread: int
+    woken: threading.Event
 
 
 class Cores:
@@ -49,8 +50,11 @@ class Cores:
 
     def __init__(self, num: int = os.cpu_count() or 1, settings: CoresSettings = CoresSettings()) -> None:
         """Allow `num` computations at once."""
-        self._changed, self._settings = threading.Condition(), settings
-        self._free, self._free_for = num, {False: settings.num_hands, True: max(1, num - 1)}
+        self._lock, self._settings = threading.Lock(), settings
+        self._left = threading.Condition(self._lock)
+        """Notified when somebody gives a slot back."""
+        self._num, self._most = num, {False: settings.num_hands, True: max(1, num - 1)}
+        """Number of slots, and of those of hands and of refinements."""
         self._numbers = itertools.count()
         self.queue: list[_Place] = []
         """Those who wait; the smallest is next."""
@@ -68,27 +72,29 @@ class Cores:
             UnwantedError: it is cancelled.
         """
         end_if(cancelled or never)
-        debt = settle()
-        with self._changed:
-            place = _Place(cancelled is not None, debt, next(self._numbers), threading.get_ident())
+        place = _Place(cancelled is not None, settle(), next(self._numbers), threading.get_ident(), threading.Event())
+        with self._lock:
             self.queue.append(place)
-            try:
-                look = self._settings.look if place.refines else None
-                while not self._changed.wait_for(lambda: self._is_next(place), look):
-                    end_if(cancelled or never)
-                self._take(place, 1)
-                self._held.append(place)
-            finally:
-                self.queue.remove(place)
-                self._changed.notify_all()  # another one may be next now
+            self._admit()
         try:
+            while place not in self._held:
+                place.woken.wait(self._settings.look if place.refines else None)
+                place.woken.clear()
+                end_if(cancelled or never)
             yield
         finally:
             settle()
-            with self._changed:
-                self._take(place, -1)
-                self._held.remove(place)
-                self._changed.notify_all()
+            with self._lock:
+                (self._held if place in self._held else self.queue).remove(place)
+                self._admit()
+                self._left.notify_all()
+
+    def wake(self, thread: int) -> None:
+        """Have a thread that waits for a slot ask at once whether that is still wanted."""
+        with self._lock:
+            for place in self.queue:
+                if place.thread == thread:
+                    place.woken.set()
 
     def give_way(self) -> None:
         """Pause for a while if this thread's account is overdrawn and others compute, or wait, who owe less.
@@ -98,13 +104,13 @@ class Cores:
         debt, own = settle(), threading.get_ident()
         if not debt:
             return
-        with self._changed:
+        with self._left:
 
             def is_last() -> bool:
                 others = [place for place in (*self._held, *self.queue) if place.thread != own]
                 return all(place.debt >= debt for place in others)
 
-            self._changed.wait_for(is_last, self._settings.longest)
+            self._left.wait_for(is_last, self._settings.longest)
 
     def giving_way(self, cancelled: Cancelled) -> Cancelled:
         """Return the same question, which gives way whenever it is asked: between parts of what takes long."""
@@ -115,9 +121,15 @@ class Cores:
 
         return asked
 
-    def _take(self, place: _Place, num: int) -> None:
-        self._free -= num
-        self._free_for[place.refines] -= num
+    def _admit(self) -> None:
+        """Give slots to those who are next, as far as there are any."""
+        while self.queue:
+            place = min(self.queue)
+            if len(self._held) == self._num or self._num_held(refines=place.refines) == self._most[place.refines]:
+                return
+            self.queue.remove(place)
+            self._held.append(place)
+            place.woken.set()
 
-    def _is_next(self, place: _Place) -> bool:
-        return place == min(self.queue) and self._free > 0 and self._free_for[place.refines] > 0
+    def _num_held(self, *, refines: bool) -> int:
+        return sum(place.refines == refines for place in self._held)

@@ -43,6 +43,11 @@ _cores = Cores()
 """Slots of all engines."""
 
 
+def wake(thread: int) -> None:
+    """Have what waits for a slot on a thread ask whether it is still wanted."""
+    _cores.wake(thread)
+
+
 class Engine:
     """Computes frames for one visitor; one thread calls it.
 

@@ -22,15 +22,23 @@ class Jobs:
     between its parts and leave out the rest. What was submitted last to a lane is always done.
     """
 
-    def __init__(self, fail: Callable[[Exception], None], account: Account | None = None) -> None:
+    def __init__(
+        self,
+        fail: Callable[[Exception], None],
+        account: Account | None = None,
+        wake: Callable[[int], None] = lambda _thread: None,
+    ) -> None:
         """Wait for work; `fail` is told of the exceptions that it raises, unless the visitor has left.
 
-        Its processor time is charged to the visitor's `account`, if there is one.
+        Its processor time is charged to the visitor's `account`, if there is one; `wake` is told the number of a thread
+        whose work is superseded.
         """
-        self._fail, self._account = fail, account
+        self._fail, self._account, self._wake = fail, account, wake
         self._changed = threading.Condition()
         self._lanes: dict[str, deque[Work]] = {}
         """Work that waits, of each lane that has a thread."""
+        self._threads: dict[str, int] = {}
+        """Numbers of the lanes' threads."""
         self.closed = False
         """Whether the visitor has left."""
 
@@ -46,6 +54,7 @@ class Jobs:
             dropped = self._drop(lane) if latest else 0
             if lane in self._lanes:
                 self._lanes[lane].append(work)
+                self._supersede(lane)
             else:
                 # it waits until this lets go; a lane without a thread, where none can start, would be busy for ever
                 threading.Thread(target=self._run, args=(lane,), name=lane, daemon=True).start()
@@ -82,7 +91,12 @@ class Jobs:
             self.closed = True
             for lane in self._lanes:
                 self._drop(lane)
+                self._supersede(lane)
             self._changed.notify_all()
+
+    def _supersede(self, lane: str) -> None:
+        if lane in self._threads:
+            self._wake(self._threads[lane])
 
     def _drop(self, lane: str) -> int:
         waiting = self._lanes.get(lane, deque())
@@ -93,9 +107,10 @@ class Jobs:
     def _run(self, lane: str) -> None:
         while True:
             with self._changed:
+                self._threads[lane] = threading.get_ident()
                 waiting = self._lanes[lane]
                 if not waiting:
-                    del self._lanes[lane]
+                    del self._lanes[lane], self._threads[lane]
                     self._changed.notify_all()
                     return
                 work = waiting.popleft()

@@ -22,7 +22,7 @@ from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import IMITATION, as_fresh
 from dt_viz.scenario.tasks import Task
 from dt_viz.session.arms import Engines, NewEngine
-from dt_viz.session.engine import Engine
+from dt_viz.session.engine import Engine, wake
 from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.history import History
 from dt_viz.session.jobs import Jobs
@@ -86,7 +86,7 @@ class Session:
         """The newest frame; None before the first one."""
         self._num_skipped = self._num_edits = 0
         """Edits that a newer one overtook, and all."""
-        self.jobs = Jobs(self.fail, account)
+        self.jobs = Jobs(self.fail, account, wake)
         """All work of the visitor beside the server's event loop."""
         self._adopt()
         self._submit()

@@ -21,6 +21,8 @@ LANE = "arm"
 """Lane of the jobs on which the arm moves."""
 SHORTEST, LONGEST = 1 / 20, 1 / 6
 """Bounds of the time from one picture of the arm to the next, seconds."""
+ASLEEP = 0.5
+"""The same while the arm waits for its page to be touched, seconds."""
 PART = 1 / 12
 """Part of that time that moving and drawing the arm takes, at most: the more visitors there are, the fewer pictures."""
 
@@ -74,8 +76,19 @@ class Playback:
         self.live, self.replay = live, Replay()
         self.arm: LiveArm | Replay = live
         """What moves now, with its joint angles `q` and `undisturbed`, (n,), rad, and the time since it `arrived`."""
+        self.neglected = False
+        """Whether nobody has touched the page for a while, and others need the processor: the goal is not left then."""
         self._draw = draw
         self._playing, self._speed = True, 1.0
+
+    @property
+    def note(self) -> str:
+        """What is unusual about where the arm is, in words; empty if nothing is."""
+        return "rests until you touch the page" if self._waits else self.live.note
+
+    @property
+    def _waits(self) -> bool:
+        return self.neglected and 0 < self.arm.arrived < RoundSettings().rest
 
     def begin(self, jobs: Jobs, fail: Callable[[Exception], None]) -> None:
         """Move the arm until the jobs are closed; `fail` is told what stops it until its next motion."""
@@ -100,11 +113,11 @@ class Playback:
             jobs.rest(LANE, max(0.0, before + period - time.monotonic()))
             if jobs.superseded(LANE):
                 return
-            now = time.monotonic()
+            now, waits = time.monotonic(), self._waits
             try:
-                self.advance(now - before)
+                self.advance(0.0 if waits else now - before)
             except Exception as error:
                 logger.exception("the arm stopped")
                 self.live.stop()
                 fail(error)
-            before, period = now, min(max(SHORTEST, (time.monotonic() - now) / PART), LONGEST)
+            before, period = now, ASLEEP if waits else min(max(SHORTEST, (time.monotonic() - now) / PART), LONGEST)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import socket
 import threading
 import time
@@ -34,6 +35,8 @@ MAX_WAITING = 8
 """Largest number of visitors who wait for a place, unless it is chosen."""
 IDLE = 600.0
 """Time after which a visitor who does nothing gives his place to one who waits, seconds."""
+NEGLECTED = 30.0
+"""Time after which the arm of a page that nobody touches rests where many are here, seconds."""
 LEAVING = "Others wait for a place, and you have done nothing for a while: you are in line again."
 """What he is told."""
 CLOSING = "The server ends. This page opens again by itself when it is back."
@@ -125,8 +128,14 @@ class Server:
             self.attend()
 
     def attend(self) -> None:
-        """See to those who wait: a place may be free in another process, or taken by somebody who does nothing."""
+        """See to those who wait, as a place may be free in another process, and to those who do nothing.
+
+        Where there are more visitors than cores, their arms rest; where others wait, the quietest gives his place.
+        """
         self._admit()
+        many = len(self.visitors) > (os.cpu_count() or 1)
+        for visitor in self.visitors:
+            visitor.robot.playback.neglected = many and self.gate.idle(visitor.client) > NEGLECTED
         with self._lock:
             for _, said, came in self._waiting.values():
                 if said is not None:

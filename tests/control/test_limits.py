@@ -8,8 +8,10 @@ from body_spheres import cover
 
 from dt_viz.avoidance.arm import WholeArm
 from dt_viz.avoidance.avoidance import ArmAvoidance
-from dt_viz.control.limits import AccelerationLimit, ObstacleLimit, RangeLimit, VelocityLimit
+from dt_viz.control.limits import ObstacleLimit
 from dt_viz.control.obstacle_motion import ObstacleMotion, Sighting
+from dt_viz.kernels.dodging import LimitedArm
+from dt_viz.kernels.limits import IMMOBILE, NUM_ROWS, STEADIEST, barrier, velocity_bounds
 from dt_viz.obstacles.shapes import Box, Cylinder, Sphere, as_point
 from dt_viz.obstacles.union import Union
 
@@ -23,8 +25,8 @@ def _arm(engine):
     return engine.follower.whole_arm
 
 
-@pytest.fixture(scope="module", name="barrier")
-def _barrier(arm):
+@pytest.fixture(scope="module", name="limit")
+def _limit(arm):
     return ObstacleLimit(arm, KEPT, GAIN, REACH)
 
 
@@ -52,11 +54,11 @@ def scenes(arm: WholeArm, num):
         yield q, Sighting(0.0, ArmAvoidance(Union(tuple(shapes)), margin=0.02), motions)
 
 
-def test_rows_are_the_rates_at_which_distances_change(arm, barrier):
+def test_rows_are_the_rates_at_which_distances_change(arm, limit):
     """With the slope s by the joints and the obstacle's own velocity: ḣ = s·q̇ − n·v ≥ −γh is s·q̇ ≥ b."""
     rng = np.random.default_rng(1)
     for q, seen in scenes(arm, 40):
-        slopes, bounds, nearest = barrier.rows(q, seen, TICK)
+        slopes, bounds, nearest = limit.rows(q, seen, TICK)
         h = distances(arm, q, seen)
         assert nearest == pytest.approx(h.min() + KEPT)
         for velocity in rng.normal(size=(3, 6)):
@@ -66,34 +68,44 @@ def test_rows_are_the_rates_at_which_distances_change(arm, barrier):
                 assert np.abs(slack - row).min() < 2e-3
 
 
-def test_less_is_kept_where_less_is_asked_for_and_nothing_without_obstacles(arm, barrier):
+def test_less_is_kept_where_less_is_asked_for_and_nothing_without_obstacles(arm, limit):
     q, seen = next(scenes(arm, 1))
     assert seen.avoidance is not None
     closer = replace(seen, avoidance=replace(seen.avoidance, margin=0.0))
-    (slopes, bounds, nearest), (same, lower, as_near) = barrier.rows(q, seen, TICK), barrier.rows(q, closer, TICK)
+    (slopes, bounds, nearest), (same, lower, as_near) = limit.rows(q, seen, TICK), limit.rows(q, closer, TICK)
     assert nearest == as_near
     np.testing.assert_array_equal(slopes, same)
     np.testing.assert_allclose(bounds - lower, GAIN * KEPT, atol=1e-12)
     for nothing in (None, ArmAvoidance(())):
-        slopes, bounds, nearest = barrier.rows(q, replace(seen, avoidance=nothing, motions=()), TICK)
+        slopes, bounds, nearest = limit.rows(q, replace(seen, avoidance=nothing, motions=()), TICK)
         assert slopes.shape == (0, 6) and not len(bounds) and nearest == np.inf
 
 
 def test_who_obeys_brakes_before_the_range_ends_and_keeps_speed_and_acceleration(arm):
     """Random wishes for 10⁵ ticks, many of them towards a limit."""
     robot, rng, acceleration = arm.robot, np.random.default_rng(2), 4.0
-    limits = RangeLimit(robot, acceleration), VelocityLimit(robot.velocity_limits), AccelerationLimit(acceleration)
+    ranges = robot.lower, robot.upper, robot.velocity_limits
+    limited = LimitedArm(robot.records, robot.links.spheres, *ranges, acceleration)
     q, velocity, nearest = robot.home.copy(), np.zeros(6), np.inf
     for _ in range(2000):
         wanted = rng.normal(scale=2.0, size=6)
         for _ in range(50):
-            lower, upper = np.full(6, -np.inf), np.full(6, np.inf)
-            for limit in limits:
-                lowest, highest = limit.bounds(q, velocity, TICK)
-                lower, upper = np.clip(lower, lowest, highest), np.clip(upper, lowest, highest)
+            lower, upper = velocity_bounds(limited, q, velocity, TICK)
             before, velocity = velocity, np.clip(wanted, lower, upper)
             assert np.abs(velocity - before).max() <= acceleration * TICK * (1 + 1e-9)
             q = q + TICK * velocity
             nearest = min(nearest, (q - robot.lower).min(), (robot.upper - q).min())
         assert (np.abs(velocity) <= robot.velocity_limits * (1 + 1e-9)).all()
     assert 0 <= nearest < 0.01
+
+
+@pytest.mark.parametrize("num", [0, 1, NUM_ROWS, 40])
+def test_barriers_are_those_of_the_smallest_distances_that_joints_change(num):
+    rng = np.random.default_rng(num)
+    h, slopes = rng.normal(size=num), rng.normal(size=(num, 6)) * (rng.random((num, 1)) < 0.8)
+    moved = np.flatnonzero((slopes**2).sum(axis=1) > IMMOBILE)
+    near, bounds = barrier(h, slopes, GAIN, TICK)
+    np.testing.assert_array_equal(near, moved[np.argsort(h[moved])][:NUM_ROWS])
+    np.testing.assert_allclose(bounds, -GAIN * np.where(h[near] > 0, h[near], 2 * h[near]))
+    _, slower = barrier(h, slopes, 1e3, TICK)
+    np.testing.assert_allclose(slower * TICK, -STEADIEST * np.where(h[near] > 0, h[near], 2 * h[near]))

@@ -79,7 +79,7 @@ def test_who_follows_a_hand_goes_first_and_else_who_came_first(crowd):
 
 @pytest.mark.parametrize("crowd", [[2], [3]], indirect=True)
 def test_refinements_leave_a_slot_to_who_follows_a_hand(crowd):
-    num = crowd.cores._free
+    num = crowd.cores._num
     for name in "ABC":
         crowd.come(name)
     assert crowd.order == list("ABC")[: num - 1]
@@ -116,6 +116,30 @@ def test_a_refinement_that_is_cancelled_leaves_the_queue_and_takes_nobodys_slot(
     assert crowd.order == ["A", "B left", "C"]
     crowd.come("D", unwanted.is_set)
     assert crowd.order[-1] == "D left"  # nor does it begin
+
+
+def test_what_waits_and_is_not_wanted_any_more_leaves_at_once_when_it_is_woken():
+    cores, unwanted, left = Cores(1, CoresSettings(look=100 * PATIENCE)), threading.Event(), threading.Event()
+
+    def want():
+        try:
+            with cores.slot(unwanted.is_set):
+                pass
+        except UnwantedError:
+            left.set()
+
+    thread = threading.Thread(target=want, daemon=True)
+    with cores.slot():
+        thread.start()
+        while not cores.queue:
+            threading.Event().wait(0.001)
+        unwanted.set()
+        cores.wake(threading.get_ident())
+        assert not left.wait(0.2)  # another one was woken
+        assert thread.ident is not None
+        cores.wake(thread.ident)
+        assert left.wait(PATIENCE)
+    assert not cores.queue
 
 
 def owing(debt):

@@ -42,6 +42,27 @@ class Gate:
         assert self.go.wait(PATIENCE)
 
 
+def test_a_thread_whose_work_is_superseded_is_woken_when_newer_work_comes_and_when_the_visitor_leaves():
+    woken, numbers, gates = [], {}, {lane: Gate() for lane in "ab"}
+    jobs = Jobs(lambda error: pytest.fail(str(error)), wake=woken.append)
+
+    def compute(lane):
+        numbers[lane] = threading.get_ident()
+        gates[lane]()
+
+    for lane, gate in gates.items():
+        jobs.submit(lane, lambda lane=lane: compute(lane))
+        assert gate.begun.wait(PATIENCE)
+    assert woken == []
+    jobs.submit("a", lambda: None, latest=True)
+    assert woken == [numbers["a"]]
+    jobs.close()
+    assert woken[1:] == [numbers["a"], numbers["b"]]
+    for gate in gates.values():
+        gate.go.set()
+    assert jobs.wait_idle(timeout=PATIENCE)
+
+
 class Started(Jobs):
     """Jobs that note what they have done, and what failed."""
 

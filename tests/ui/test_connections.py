@@ -300,6 +300,28 @@ async def test_who_does_nothing_gives_his_place_to_one_who_waits_and_only_then(u
 
 
 @asynchronous
+@pytest.mark.parametrize(("num_cores", "expected"), [(1, [True, False]), (2, [False, False])])
+async def test_where_many_are_here_the_arm_of_a_page_that_nobody_touches_rests(
+    url, server, monkeypatch, num_cores, expected
+):
+    monkeypatch.setattr(server_module, "NEGLECTED", 1.0)
+    monkeypatch.setattr(server_module.os, "cpu_count", lambda: num_cores)
+    async with Client(url) as idle, Client(url) as busy:
+        for client in (idle, busy):
+            await client.look()
+            assert await client.wait_for(lambda c=client: c.has_picture, PATIENCE)
+        await asyncio.sleep(1.2)
+        await busy.look()
+        assert await answers(busy)
+        server.attend()
+        assert [visitor.robot.playback.neglected for visitor in server.visitors] == expected
+        await idle.look()
+        assert await answers(idle)
+        server.attend()
+        assert not any(visitor.robot.playback.neglected for visitor in server.visitors)
+
+
+@asynchronous
 async def test_open_sockets_are_bounded_too(url, server, monkeypatch):
     def ended(sock):
         try:

@@ -140,6 +140,36 @@ def test_the_longer_a_picture_takes_the_fewer_there_are(monkeypatch):
     assert np.diff(begun)[1:].min() > 0.9 * 0.005 / playback_module.PART
 
 
+def test_the_arm_of_a_neglected_page_comes_to_the_goal_and_rests_there_until_it_is_touched(monkeypatch):
+    monkeypatch.setattr(playback_module, "SHORTEST", 1 / 200)
+    monkeypatch.setattr(playback_module, "ASLEEP", 1 / 100)
+    arm: Any = Arm()
+    arm.note = "as the arm says"
+    drawn, playback = threading.Semaphore(0), cast(Playback, None)
+
+    def draw():
+        arm.arrived = max(0.0, float(arm.q[0]) - 0.1)
+        drawn.release()
+
+    def drawn_again(times):
+        for _ in range(times):
+            assert drawn.acquire(timeout=PATIENCE)
+
+    playback, jobs = playback_of(arm, draw)
+    playback.neglected = True
+    while playback.note == "as the arm says":
+        drawn_again(1)
+    assert playback.note == "rests until you touch the page" and arm.arrived > 0
+    drawn_again(3)
+    there = arm.q
+    drawn_again(10)
+    assert arm.q[0] == there[0]
+    playback.neglected = False
+    drawn_again(10)
+    assert arm.q[0] > there[0] and playback.note == "as the arm says"
+    jobs.close()
+
+
 def test_its_time_has_the_chosen_pace_and_a_pause_stops_it(player):
     player.playback.play(True, 2.0, replays=False)
     assert player.play(0.5)[-1] == pytest.approx(1.0)

@@ -87,6 +87,8 @@ class ArmPicture(ArmFrames):
 
     @stale.setter
     def stale(self, stale: bool) -> None:
+        if stale == self.stale:
+            return  # each mesh would be a message
         self._note.visible = stale
         for mesh in self.meshes:
             mesh.opacity = STYLES.arm_stale.opacity if stale else None

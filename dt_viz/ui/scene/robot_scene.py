@@ -118,7 +118,7 @@ class RobotScene:
             self.their_arm.pose(now, q, speed, sets_out=sets_out)
             if not view.replay:
                 self.path.show(now, hand, lambda: playback.live.ahead, tubes, self._theme)
-                self.grip.say(playback.live.note)
+                self.grip.say(playback.note)
 
     def _hold(self, place: Array, phase: str) -> None:
         self.playback.live.hold(place)

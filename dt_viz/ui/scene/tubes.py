@@ -11,7 +11,7 @@ import viser
 from scipy.spatial import KDTree
 
 from dt_viz.flows.fields import Array, Indices
-from dt_viz.metrics import interpolate
+from dt_viz.kernels.tubes import evenly_bent, tubes
 from dt_viz.ui.scene.palette import LIGHT, Theme
 from dt_viz.ui.scene.style import Style
 
@@ -45,48 +45,16 @@ class Tubes:
         """
         vertices, faces = _NOTHING
         if len(middles):
-            vertices = tubes(middles, scale * self._style.radius, scale * self._style.ball)
+            vertices = tubes(middles, scale * self._style.radius, scale * self._style.ball, NUM_SIDES)
             faces = tube_faces(*vertices.shape[:3])
         if len(faces) != len(self.node.faces):
             self.node.faces = np.asarray(faces, np.uint32)
-        self.node.vertices = vertices.reshape(-1, 3).astype(np.float32)
+        self.node.vertices = vertices.reshape(-1, 3)
         self.node.color = self._style.on(theme)
 
 
 _NOTHING = np.zeros((3, 3), np.float32), np.array([[0, 1, 2]])
 """A triangle without size."""
-
-
-def tubes(paths: Array, radius: float, ball: float = 0.0) -> Array:
-    """Return the vertices (R, K, `NUM_SIDES`, 3) of tubes around paths (R, T, 3), metres, in K rings.
-
-    The rings do not twist: their frames go along by double reflection (Wang et al., "Computation of Rotation
-    Minimizing Frames", 2008), which takes a frame of each ring to one of the next.
-    """
-    tangents = np.gradient(paths, axis=1)
-    tangents /= np.maximum(np.linalg.norm(tangents, axis=2, keepdims=True), 1e-12)
-    least = np.eye(3)[np.abs(tangents).argmin(axis=2)]
-    normals = least - (least * tangents).sum(axis=2, keepdims=True) * tangents
-    normals /= np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-12)
-    across, between = np.cross(tangents, normals), np.diff(paths, axis=1)
-    normal, tangent = _reflected(between, normals[:, :-1]), _reflected(between, tangents[:, :-1])
-    carried = _reflected(tangents[:, 1:] - tangent, normal)
-    twist = np.arctan2((carried * across[:, 1:]).sum(axis=2), (carried * normals[:, 1:]).sum(axis=2))
-    angle = np.pad(np.cumsum(twist, axis=1), ((0, 0), (1, 0)))[..., None]
-    normals = np.cos(angle) * normals + np.sin(angle) * across
-    turn = np.linspace(0, 2 * np.pi, NUM_SIDES, endpoint=False)[:, None]
-
-    def ring(normal: Array, tangent: Array) -> Array:
-        return np.cos(turn) * normal[..., None, :] + np.sin(turn) * np.cross(tangent, normal)[..., None, :]
-
-    rings = paths[:, :, None] + radius * ring(normals, tangents)
-    ends = np.broadcast_to(paths[:, -1:, None], rings[:, :1].shape)
-    first, along = paths[:, :1, None], tangents[:, :1, None]
-    if ball == 0:
-        return np.concatenate([np.broadcast_to(first, ends.shape), rings, ends], axis=1)
-    height = np.linspace(np.pi, 0, 6)[None, :, None, None]
-    globe = first + ball * (np.cos(height) * along + np.sin(height) * ring(normals[:, :1], tangents[:, :1]))
-    return np.concatenate([globe, rings, ends], axis=1)
 
 
 @lru_cache(maxsize=16)
@@ -99,26 +67,10 @@ def tube_faces(num: int, num_rings: int, num_sides: int) -> Indices:
     return faces.reshape(-1, 3)
 
 
-def evenly_bent(path: Array, num: int = NUM_RINGS) -> Array:
-    """Return (num, 3) points of a path (T, 3), metres: the denser the more it bends."""
-    pieces = np.diff(path, axis=0)
-    length = np.linalg.norm(pieces, axis=1)
-    directions = pieces / np.maximum(length, 1e-12)[:, None]
-    turn = np.linalg.norm(np.diff(directions, axis=0, prepend=directions[:1]), axis=1)
-    # a turn by one radian needs as many rings as 3 cm of the path
-    measure = np.concatenate([[0.0], np.cumsum(np.maximum(length + 0.03 * turn, 1e-12))])
-    return interpolate(np.linspace(0, measure[-1], num), measure, path)
-
-
 def middles_of(paths: Sequence[Array]) -> Array:
     """Return the middles (R, `NUM_RINGS`, 3) of the rings of tubes around paths (T_i, 3), metres."""
-    return np.stack([evenly_bent(path) for path in paths]) if len(paths) else np.zeros((0, NUM_RINGS, 3))
-
-
-def _reflected(across: Array, vectors: Array) -> Array:
-    """Vectors (*B, 3) reflected in planes across others (*B, 3)."""
-    size = np.maximum((across * across).sum(axis=-1, keepdims=True), 1e-18)
-    return vectors - 2 * (across * vectors).sum(axis=-1, keepdims=True) / size * across
+    middles = [evenly_bent(np.array(path, float, order="C"), NUM_RINGS) for path in paths]
+    return np.stack(middles) if middles else np.zeros((0, NUM_RINGS, 3))
 
 
 @dataclass(frozen=True, eq=False)

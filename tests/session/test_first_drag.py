@@ -1,0 +1,11 @@
+"""What a drag calls is compiled before the first visitor comes: nobody's first drag stands still for seconds."""
+
+import subprocess
+import sys
+
+import first_drag
+
+
+def test_nothing_is_compiled_in_the_first_drag():
+    said = subprocess.run([sys.executable, first_drag.__file__], capture_output=True, text=True, check=False)
+    assert (said.stdout.strip(), said.stderr) == ("[]", "")
