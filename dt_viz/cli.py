@@ -63,10 +63,9 @@ def _serve(options: argparse.Namespace) -> int:
     # numerical libraries read these when they are first imported
     from dt_viz.errors import DataError  # noqa: PLC0415
     from dt_viz.folders import default_cache_folder  # noqa: PLC0415
-    from dt_viz.learning.demonstrations import load_demonstrations  # noqa: PLC0415
     from dt_viz.learning.imitation import ImitationError  # noqa: PLC0415
     from dt_viz.learning.store import FitStore  # noqa: PLC0415
-    from dt_viz.scenario.tasks import OWN, TaskEntry, known_tasks, own_task  # noqa: PLC0415
+    from dt_viz.scenario.tasks import OWN, TaskEntry, known_tasks  # noqa: PLC0415
     from dt_viz.serving.board import Board, own_share  # noqa: PLC0415
     from dt_viz.serving.listening import AddressError, listen  # noqa: PLC0415
     from dt_viz.serving.supervisor import Supervisor  # noqa: PLC0415
@@ -79,8 +78,7 @@ def _serve(options: argparse.Namespace) -> int:
         robot = _robot(options)
         tasks = known_tasks(options.lasa)
         if options.files:
-            how = {name: getattr(options, name) for name in ("rate", "unit", "columns", "topic")}
-            own = own_task(load_demonstrations(options.files, **how, arm=robot))
+            own = _own(options, robot)
             tasks = {OWN: TaskEntry(own.title, lambda: own, own.demonstrations[0].dimension != 2), **tasks}
         begin = options.task or (OWN if options.files else "draw_s")
         if begin not in tasks:
@@ -122,6 +120,22 @@ def _serve(options: argparse.Namespace) -> int:
             return _work(new_server, prepare, own_share(num_connections), listening, ready)
         work = partial(_work, new_server, prepare)
         return Supervisor(listening, Board(num_processes, num_connections), work, ready).run()
+
+
+def _own(options: argparse.Namespace, robot: Robot) -> Task:
+    """Make a task of the files that are given: of demonstrations, or of a motion that the library has saved.
+
+    Raises:
+        DataError: they cannot be used.
+    """
+    from dt_viz.learning.demonstrations import load_demonstrations  # noqa: PLC0415
+    from dt_viz.saving import is_motion, motion_task  # noqa: PLC0415
+    from dt_viz.scenario.tasks import own_task  # noqa: PLC0415
+
+    how = {name: getattr(options, name) for name in ("rate", "unit", "columns", "topic")}
+    if len(options.files) == 1 and is_motion(Path(options.files[0])):
+        return motion_task(Path(options.files[0]))
+    return own_task(load_demonstrations(options.files, **how, arm=robot))
 
 
 def _work(
@@ -228,7 +242,8 @@ def _parser() -> argparse.ArgumentParser:
         "files",
         nargs="*",
         metavar="FILE",
-        help="your own demonstrations: text, .npz, .npy, .mat, .json, .parquet, .hdf5, ROS bags, or folders of them",
+        help="your own demonstrations: text, .npz, .npy, .mat, .json, .parquet, .hdf5, ROS bags, or folders of them; "
+        "or one motion that the library has saved",
     )
     parser.add_argument("--rate", type=float, metavar="HZ", help="samples per second of files without times")
     parser.add_argument("--unit", metavar="UNIT", help="units of the files, such as mm or cm,ms,deg, if not recognised")
@@ -354,7 +369,7 @@ def _prepare(fits: FitStore, task: Task, robot: Robot, share: Share, leaving: th
         if leaving.wait(0.1):
             return
     try:
-        if not has_orientations(task.demonstrations):  # else it is learned in milliseconds
+        if task.imitation is None and not has_orientations(task.demonstrations):  # else it is learned in milliseconds
             fits.get(task.demonstrations, progress=progress)
         _compile(robot, leaving)
         share.prepared()

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import os
+import zipfile
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ import numpy as np
 from dt_viz.avoidance import registry
 from dt_viz.avoidance.avoidance import SPACES, Avoidance
 from dt_viz.avoidance.transform import Transform
-from dt_viz.errors import DataError, FormatError, check_between, parsing
+from dt_viz.errors import DataError, FormatError, check_between, naming, parsing
 from dt_viz.files.checks import read_bytes
 from dt_viz.files.npz import arrays_of, npz_bytes, write_whole
 from dt_viz.files.values import CLASS, packed, unpacked
@@ -34,13 +35,19 @@ from dt_viz.learning.interface import AnyImitation
 from dt_viz.learning.patterns import AugmentedSettings
 from dt_viz.learning.preparation import ImitationError
 from dt_viz.obstacles.shapes import SHAPES, Obstacle
-from dt_viz.scenario.scenario import Layer
+from dt_viz.scenario.own import Own
+from dt_viz.scenario.relocation import in_world
+from dt_viz.scenario.saved import Known, Saved, check_shapes, decode, encode, is_saved
+from dt_viz.scenario.scenario import Layer, Scenario
+from dt_viz.scenario.tasks import OWN, TASKS, Task, own_task
 
 FORMAT = 1
 """Version of the file; raised where files from before cannot be read any more, also by a change of the imitation's
 arrays. A new field that has a default does not need that."""
 MAX_BYTES = 40 * 10**6
 """Largest number of bytes of a file, and of what it unpacks to."""
+KNOWN = Known(tuple(TASKS), arms=None, methods=None)
+"""What scenarios may name."""
 TEXT, LEARNED = "motion", "imitation."
 """Name of the array that holds the text, and prefix of those of the imitation."""
 
@@ -86,17 +93,56 @@ def save_motion(path: str | os.PathLike[str], motion: SavedMotion, imitation: An
     write_whole(path, content)
 
 
-def load_motion(path: str | os.PathLike[str]) -> tuple[SavedMotion, AnyImitation]:
-    """Read a motion from a file.
+def save_scenario(path: str | os.PathLike[str], saved: Saved) -> None:
+    """Write a scenario to a file, as the page does; an existing one is replaced only by a whole one.
 
     Raises:
-        DataError: there is no such file, it cannot be read, or is no motion saved in this format. Nothing else is
-            raised, whatever the file holds.
+        DataError: the page could not open it.
+        OSError: the file cannot be written.
+    """
+    path, content = Path(path), encode(saved).encode()
+    decode(content, KNOWN, str(path))  # what could not be read is refused now
+    write_whole(path, content)
+
+
+def is_motion(path: Path) -> bool:
+    """Return whether a file says that it is a saved motion, whether or not it can be read."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return f"{TEXT}.npy" in archive.namelist()
+    except (OSError, zipfile.BadZipFile):
+        return False
+
+
+def motion_task(path: Path) -> Task:
+    """Return a saved motion as a task of the page, with what was learned and its transforms.
+
+    Raises:
+        DataError: it cannot be read, or has what the page has not, such as two avoidances.
+    """
+    with parsing(MotionError, path, "path", "a readable file"):
+        content = read_bytes(path, MAX_BYTES)
+    saved, imitation = read_motion(content, path)
+    given = own_task(saved.demonstrations)
+    task = replace(given, title=path.stem[:40], state=imitation.state, imitation=imitation, layers=saved.layers)
+    with naming(MotionError, path):
+        scenario = Scenario(OWN, in_world(task))
+    decode(encode(Saved(scenario, own=Own.of(task))), KNOWN, str(path))  # what the page could not have is refused now
+    check_shapes(scenario, str(path))
+    return task
+
+
+def load_motion(path: str | os.PathLike[str]) -> tuple[SavedMotion, AnyImitation] | Saved:
+    """Read a motion from a file, or a scenario that the page has saved.
+
+    Raises:
+        DataError: there is no such file, it cannot be read, or is neither. Nothing else is raised, whatever the file
+            holds.
     """
     path = Path(path)
     with parsing(MotionError, path, "path", "a readable file"):
         content = read_bytes(path, MAX_BYTES)
-    return read_motion(content, path)
+    return decode(content, KNOWN, str(path)) if is_saved(content) else read_motion(content, path)
 
 
 def read_motion(content: bytes, source: str | Path) -> tuple[SavedMotion, AnyImitation]:

@@ -46,6 +46,18 @@ def until_drawn(visitor):
     pytest.fail("the page draws nothing")
 
 
+RNG = np.random.default_rng(5)
+DROP = """files => {
+    const transfer = new DataTransfer();
+    for (const [name, text] of files) transfer.items.add(new File([text], name));
+    for (const type of ['dragover', 'drop'])
+        document.body.dispatchEvent(new DragEvent(type, {dataTransfer: transfer, bubbles: true, cancelable: true}));
+}"""
+"""Drops files, each a name and a text, on the page."""
+
+STORED = "Object.keys(localStorage).find(key => key.endsWith('dt-viz'))"
+"""Script that finds the name under which the browser keeps what was made on the page."""
+
 page_errors: list[str] = []
 """What pages have complained of in their consoles."""
 OF_OTHERS = ("Unable to preventDefault inside passive event listener", "GPU stall due to ReadPixels")
@@ -112,6 +124,11 @@ def project(page, visitor: Visitor, point) -> tuple[float, float]:
     return width / 2 + focal * seen[0] / seen[2], height / 2 + focal * seen[1] / seen[2]
 
 
+def kept(page) -> str | None:
+    """What the browser keeps of what was made on the page; None if it keeps nothing."""
+    return page.evaluate(f"localStorage.getItem({STORED})")
+
+
 def press(locator):
     """Click without waiting for two alike pictures of the page, which may be long in coming."""
     locator.click(force=True)
@@ -129,3 +146,12 @@ def drag(page, start, end, steps=6):
         page.mouse.move(*(a + (b - a) * k / steps for a, b in zip(start, end, strict=True)))
         time.sleep(0.03)
     page.mouse.up()
+
+
+def take(goal=(0.2, -0.45, 0.3)):
+    """The content of a file with a recorded motion, each time another."""
+    u = np.linspace(0, 1, 150)
+    start = np.array([-0.2, -0.4, 0.2]) + RNG.normal(scale=0.01, size=3)
+    path = start + (3 * u**2 - 2 * u**3)[:, None] * (np.array(goal) - start) + RNG.normal(scale=0.001, size=(150, 3))
+    rows = np.column_stack([3 * u, path])
+    return "\n".join(["timestamp,pos_x,pos_y,pos_z", *(",".join(f"{v:.5f}" for v in row) for row in rows)]).encode()

@@ -18,6 +18,7 @@ import sys
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -40,7 +41,10 @@ from dt_viz.obstacles import files as shapes
 from dt_viz.obstacles.learned_maps import solid_map, unit_map
 from dt_viz.obstacles.shapes import ORIGIN, Box, CloudObstacle, Cylinder, MeshObstacle, Sphere
 from dt_viz.saving import SavedMotion, save_motion
-from dt_viz.scenario.scenario import Layer
+from dt_viz.scenario.own import Own
+from dt_viz.scenario.saved import Known, Saved, check_shapes, decode, encode
+from dt_viz.scenario.scenario import Layer, Scenario
+from dt_viz.scenario.tasks import OWN, TASKS, own_task
 
 PROCESS = Path("/proc/self")
 """What Linux says of this process."""
@@ -276,6 +280,37 @@ def saved_motion() -> bytes:
         return path.read_bytes()
 
 
+@cache
+def saved_scenario() -> bytes:
+    """A scenario with demonstrations, what was learned of them, obstacles and transforms of its own, saved."""
+    s, rng = np.linspace(0, 1, 20), np.random.default_rng(3)
+    turns = rng.normal(size=(20, 4))
+    turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+    arcs = [np.stack([s - 1, (1 + 0.1 * k) * s * (1 - s), 0 * s], axis=1) for k in range(2)]
+    given = tuple(demos.Demonstration(2 * s, arc, f"arc {k}", turns) for k, arc in enumerate(arcs))
+    imitation = fit(given, ImitationSettings(num_layers=2, num_points=12, max_iterations=2))
+    own = replace(Own.of(replace(own_task(given), imitation=imitation)), moves=((0.5, (0.1, -0.3, 1 / 3)),))
+    hand, bias = STACK
+    assert isinstance(hand, Avoidance)
+    stack = (Layer(bias, name="Bias 1"), Layer(replace(hand, integration=Integration()), name="Avoidance"))
+    return encode(Saved(Scenario(OWN, stack), own=own)).encode()
+
+
+def with_changed_json(content: bytes, rng: Rng) -> bytes:
+    """With other values in it, if it still is JSON."""
+    try:
+        tree = json.loads(content)
+    except ValueError:
+        return content
+    change_values(tree, rng)
+    return json.dumps(tree).encode()
+
+
+def hostile_scenario(number: int) -> bytes:
+    """The saved scenario of this number, damaged."""
+    return mutated(saved_scenario(), (*EVERYWHERE, *(with_changed_json,) * 20), np.random.default_rng((12, number)))
+
+
 def recorded_seeds() -> Iterator[tuple[str, str, bytes, tuple[Mutation, ...]]]:
     """Recorded motions of every kind, as a visitor's and as one's own, and an archive of some."""
     with TemporaryDirectory() as folder:
@@ -361,6 +396,12 @@ def read(kind: str, name: str, content: bytes) -> None:
         return
     if kind == "motion":
         saving.read_motion(content, name)
+        return
+    if kind == "scenario":
+        saved = decode(content, Known(tuple(TASKS)), name)
+        text = encode(saved)
+        assert encode(decode(text, Known(tuple(TASKS)))) == text
+        check_shapes(saved.scenario, name)
         return
     solid = shapes.read_mesh(content, name)[0] if kind == "mesh" else shapes.read_cloud(content, name)[0].solid
     assert solid.distances.depth > 0

@@ -38,7 +38,7 @@ MAY_IMPORT: Mapping[str, set[str]] = {
     "ui": BELOW_SESSION | {"kernels", "session", "baselines", "serving"},
     "evaluate": BELOW_SESSION | {"session", "baselines"},
     "examples": {"foundation"},
-    "cli": BELOW_SESSION | {"session", "serving", "ui", "evaluate"},
+    "cli": BELOW_SESSION | {"session", "serving", "ui", "evaluate", "saving"},
     "__main__": {"cli"},
 }
 """The packages from the bottom up, and which of those below each may import."""

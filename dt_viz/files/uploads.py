@@ -123,12 +123,12 @@ class _Ready:
             process = None
         return process or _Process()
 
-    def renew(self, process: _Process | None = None) -> None:
+    def renew(self, process: _Process) -> None:
         """Have a process wait for the next file: this one if it can, or a new one."""
         with self._lock:
             if self._users and self._process is None:
-                self._process = process if process is not None and process.is_idle else _Process()
-            if process is not None and self._process is not process:
+                self._process = process if process.is_idle else _Process()
+            if self._process is not process:
                 process.end()
 
     def set_user(self, user: object, *, present: bool) -> None:
@@ -164,11 +164,6 @@ def read_upload(
         return process.read(kind, [first, b"\n", *(content for _, content in files)], cancelled)
     finally:
         _ready.renew(process)
-
-
-def make_ready() -> None:
-    """Start the process for a file that is about to come."""
-    _ready.renew()
 
 
 def keep_ready(user: object) -> None:

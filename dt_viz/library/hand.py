@@ -9,6 +9,7 @@ from dt_viz.errors import FormatError
 from dt_viz.flows.fields import Array
 from dt_viz.library.motion import NUM_COORDINATES, Motion
 from dt_viz.library.orientations import angular_velocity
+from dt_viz.library.places import as_places
 
 PUSHED = 0.05
 """Distance from where the hand should be, relative to half the demonstrations' extent, from which it was pushed."""
@@ -67,7 +68,7 @@ class HandController:
         """
         _check_period(dt)
         motion, solution = self._motion, self._motion.solution
-        place = motion.in_space(motion.checked(np.asarray(position, float)[None], "position"))[0]
+        place = motion.in_space(as_places(np.asarray(position, float)[None], motion.dimension, "position"))[0]
         state = np.concatenate([place, self._rest])
         if np.linalg.norm(place - self._expected) > PUSHED * self._top:
             state = solution.system.base.caught(state, solution.stacked.forward(place))

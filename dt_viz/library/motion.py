@@ -31,22 +31,26 @@ from dt_viz.learning.inspection import Inspection
 from dt_viz.learning.patterns import AugmentedSettings
 from dt_viz.learning.preparation import DemonstrationWarning, prepare
 from dt_viz.learning.state import State, learn
+from dt_viz.library.opened import learned_for
 from dt_viz.library.orientations import along
-from dt_viz.library.places import as_place, in_space
+from dt_viz.library.places import as_place, as_places, in_space
 from dt_viz.library.report import many, missed, orientation_line, sampled, summaries
 from dt_viz.library.takes import Demonstrations, check_goals, demonstrations_of
 from dt_viz.motion.certificates import Certificates, DrawnSamples, certified
 from dt_viz.motion.diagnostics import motion_warnings
 from dt_viz.motion.nominal import NUM_SAMPLES, Learned, Nominal
-from dt_viz.motion.solve import Solved, solve
+from dt_viz.motion.solve import Solved, solve, warped
 from dt_viz.motion.stack import FINE, Solution
-from dt_viz.saving import SavedMotion, load_motion, save_motion
+from dt_viz.saving import SavedMotion, load_motion, save_motion, save_scenario
+from dt_viz.scenario.saved import Saved
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.tasks import Task
 from dt_viz.warning import in_metres
 
 NUM_COORDINATES = 3
 """Coordinates of motions in space."""
+ALONE = Scenario("", ())
+"""What was learned, with nothing stacked on it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,19 +72,25 @@ class Motion:
     """A stable motion: what was learned from demonstrations, and the transforms stacked on it. Not to be changed."""
 
     def __init__(
-        self, learned: Learned, layers: tuple[Layer, ...] = (), inspections: tuple[Inspection, ...] = ()
+        self,
+        learned: Learned,
+        scenario: Scenario = ALONE,
+        inspections: tuple[Inspection, ...] = (),
+        opened: Saved | None = None,
     ) -> None:
-        """Wrap what was learned; see `fit`."""
-        self._learned, self._layers = learned, layers
+        """Wrap what was learned, with what is stacked on it, and what was opened, if that was a scenario; see `fit`."""
+        self._learned, self._opened = learned, opened
+        self.scenario = scenario
+        """The choices of a user of the page that lead to this motion."""
         self.inspections = inspections
         """What was found about each demonstration that was given, and what was done about it."""
-        self.dimension = len(learned.imitation.goal)
-        """d: 2 of drawings, 3 of motions in space."""
+        self.dimension = NUM_COORDINATES if learned.task.draws else len(learned.imitation.goal)
+        """d: 2 of drawings, 3 of motions in space, and of drawings that the page has put there."""
 
     def __repr__(self) -> str:
         takes = many(len(self._learned.imitation.starts), "take")
         where = "the plane" if self.dimension == 2 else "space"
-        layers = "".join(f", {layer.name}" for layer in self._layers)
+        layers = "".join(f", {layer.name}" for layer in self.scenario.stack)
         goal = in_metres(self._learned.goal[: self.dimension])
         turns = " with orientation" if self.has_orientation else ""
         return f"Motion({takes} in {where}{turns}, {self.state} state, goal {goal}{layers})"
@@ -105,7 +115,7 @@ class Motion:
     @property
     def transforms(self) -> tuple[Transform, ...]:
         """The transforms on the imitation, from the inside out."""
-        return tuple(layer.transform for layer in self._layers)
+        return tuple(layer.transform for layer in self.scenario.stack)
 
     @property
     def goal(self) -> Array:
@@ -128,7 +138,7 @@ class Motion:
             name = next(name for k in range(1, len(names) + 2) if (name := f"{title} {k}") not in names)
             layer = Layer(in_space(transform, self.dimension), name=name)
             scenario = replace(scenario, stack=(*scenario.stack, layer))
-        return Motion(self._learned, scenario.stack, self.inspections)
+        return Motion(self._learned, scenario, self.inspections, self._opened)
 
     def rollouts(
         self,
@@ -159,7 +169,7 @@ class Motion:
         if starts is None:
             rays = solution.rays if label is None else replace(solution.rays, z0=solution.rays.z0[self.labelled(label)])
         else:
-            states = self._states(self.checked(np.atleast_2d(np.asarray(starts, float)), "starts"), label)
+            states = self._states(as_places(np.atleast_2d(np.asarray(starts, float)), self.dimension, "starts"), label)
             rays = Rays(system.transform.forward(states), system.base)
         evaluate = lambda index, fraction: system.transform.inverse(rays.at(index, fraction))[:, None, :3]  # noqa: E731
         bundle = refined(evenly_sampled(evaluate, len(rays.z0), NUM_SAMPLES), evaluate, spacing)
@@ -187,7 +197,7 @@ class Motion:
                 numbers each.
         """
         points = np.asarray(y, float)
-        self.checked(points.reshape(-1, points.shape[-1] if points.ndim else 1), "y")
+        as_places(points.reshape(-1, points.shape[-1] if points.ndim else 1), self.dimension, "y")
         places, system = self.in_space(points.reshape(-1, self.dimension)), self.solution.system
         if phase is not None or self.state == "plain":
             velocity = frozen(system, self.rest(phase, start, label)).velocity(places)
@@ -247,49 +257,54 @@ class Motion:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the motion to a file (npz, whatever its suffix): what was learned, the demonstrations and the stack.
 
-        A file that is there is replaced, and stays as it is if something fails.
+        One that was opened from a scenario is written as that (JSON). An existing file is only replaced by a whole one.
 
         Raises:
             DataError: a transform is not one of `dt_viz.avoidance.registry.KINDS`, or holds what could not be read.
             OSError: the file cannot be written.
         """
+        if self._opened is not None:
+            save_scenario(path, replace(self._opened, scenario=self.scenario))
+            return
         demonstrations, imitation = self._learned.task.demonstrations, self._learned.imitation
         chosen = self.state == "augmented", imitation.labels, self.reason, imitation.augmented
-        save_motion(path, SavedMotion(demonstrations, self._layers, *chosen, self.inspections), imitation)
+        save_motion(path, SavedMotion(demonstrations, self.scenario.stack, *chosen, self.inspections), imitation)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Motion:
         """Read the motion that `save` wrote: its paths, velocities and certificates are the same to the last bit.
 
+        Or read a scenario that the page has saved, whose task is learned as there: its motion is the page's, from the
+        demonstrations' starts and then the added ones, in the page's frame (`dt.load_arm("jaco", frame="page")`).
+
         An augmented motion is learned again from its demonstrations, so that this holds for one version of DT-Viz.
 
         Raises:
-            DataError: there is no such file, it cannot be read, or is no saved motion. Nothing else is raised,
-                whatever the file holds; nothing is unpickled.
+            DataError: there is no such file, it cannot be read, or is neither. Nothing else is raised, whatever the
+                file holds, but ImitationError for a scenario; nothing is unpickled.
         """
-        saved, imitation = load_motion(path)
+        read = load_motion(path)
+        if isinstance(read, Saved):
+            return cls(learned_for(read, os.fspath(path)), read.scenario, opened=read)
+        saved, imitation = read
         learned = Learned.of(Task(demonstrations=saved.demonstrations), imitation, imitates=True)
-        return cls(learned, saved.layers, saved.inspections)
+        return cls(learned, Scenario("", saved.layers), saved.inspections)
 
     @cached_property
     def solved(self) -> Solved:
         """The motion of the hand, as exactly as it is computed."""
-        return solve(self.scenario, self.nominal, FINE)
+        full, fraction = solve(self.scenario, self.nominal, FINE), self.scenario.warp
+        return full if fraction == 1 else warped(full, self.nominal.warped(fraction), fraction, FINE, None)
 
     @property
     def solution(self) -> Solution:
         """Its stack."""
         return self.solved.stack
 
-    @property
-    def scenario(self) -> Scenario:
-        """The choices of a user of the page that lead to this motion."""
-        return Scenario("", self._layers)
-
-    @property
+    @cached_property
     def nominal(self) -> Nominal:
-        """The motion without what is stacked on it, from the demonstrations' starts."""
-        return self._learned.demonstrated
+        """The motion without what is stacked on it, from the demonstrations' starts, and from those of a scenario."""
+        return self._learned.nominal([self._learned.trajectory(start) for start in self.scenario.starts])
 
     def _states(self, places: Array, label: float | None) -> Array:
         """The states (R, k) in which motions from places (R, d) begin."""
@@ -299,7 +314,7 @@ class Motion:
         """The states (N, k) along the motion from a start (d,), or along those of the demonstrations with a label."""
         system, rays = self.solution.system, self.solution.rays
         if start is not None:
-            began = self._states(self.checked(np.asarray(start, float)[None], "start"), label)
+            began = self._states(as_places(np.asarray(start, float)[None], self.dimension, "start"), label)
             rays = Rays(system.transform.forward(began), system.base)
         elif label is not None:
             rays = replace(rays, z0=rays.z0[self.labelled(label)])
@@ -310,7 +325,7 @@ class Motion:
     def rest(self, phase: float | None, start: ArrayLike | None, label: float | None) -> Array:
         """Find what the state of a motion from a start (d,) has besides the place, at a phase; None is at its start."""
         began = self._learned.task.starts[0, : self.dimension] if start is None else np.asarray(start, float)
-        rest = self._states(self.checked(began[None], "start"), label)[0, NUM_COORDINATES:]
+        rest = self._states(as_places(began[None], self.dimension, "start"), label)[0, NUM_COORDINATES:]
         if phase is not None:
             check_between("phase", phase, 0.0, 1.0)
             rest[:1] *= phase
@@ -321,15 +336,6 @@ class Motion:
         if label not in self.labels:
             raise unknown_label(label, self.labels)
         return np.flatnonzero(np.array(self.demonstrated_labels) == label)
-
-    def checked(self, places: Array, field: str) -> Array:
-        """Places (N, d) that were given, checked."""
-        if places.ndim != 2 or places.shape[1] != self.dimension or not len(places):
-            shape = "×".join(str(n) for n in places.shape)
-            raise FormatError(field, f"{shape} numbers", f"places of {self.dimension} coordinates, metres")
-        if not np.isfinite(places).all():
-            raise FormatError(field, "a number that is not finite", "finite numbers, metres")
-        return places
 
     def in_space(self, points: Array) -> Array:
         """Points (N, 3) of points (N, d)."""
@@ -361,8 +367,8 @@ def fit(
             too, and learns the hand's orientation where all takes have it. "auto" is that then; else plain where a fit
             with the default settings misses no demonstration by more than 5 % of their extent and, with three or more,
             follows those that are left out about as well as the augmented state.
-        labels: a number for each demonstration, where they differ although they begin at one place: those with one
-            number are of one pattern; makes the state augmented. None finds them where that is so; see `Motion.labels`.
+        labels: a number for each demonstration, its pattern's, where they differ although they begin at one place;
+            makes the state augmented. None finds them where that is so; see `Motion.labels`.
         settings: of the plain fit, the objective included, and of the preparation; None takes the defaults.
         augmented: settings of the augmented state; None takes the defaults, and that preparation.
         rate: samples a second, Hz, of arrays and tables without times; None takes each take as 5 s long.

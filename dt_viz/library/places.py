@@ -11,6 +11,7 @@ import numpy as np
 from dt_viz.avoidance.avoidance import Avoidance
 from dt_viz.avoidance.transform import Anchored, Planar, Transform
 from dt_viz.errors import FormatError
+from dt_viz.flows.fields import Array
 from dt_viz.obstacles.shapes import Obstacle, Point
 
 PLANE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
@@ -50,6 +51,16 @@ def as_place(given: Any, dimension: int, field: str) -> tuple[float, ...]:  # no
         accepted = "(x, y), metres: the motion is in the plane" if dimension == 2 else "(x, y, z), metres"
         raise FormatError(field, repr(given)[:80], accepted)
     return place
+
+
+def as_places(places: Array, dimension: int, field: str) -> Array:
+    """Places (N, d) that were given, of a dimension d. Raises FormatError where they are not that."""
+    if places.ndim != 2 or places.shape[1] != dimension or not len(places):
+        shape = "×".join(str(n) for n in places.shape)
+        raise FormatError(field, f"{shape} numbers", f"places of {dimension} coordinates, metres")
+    if not np.isfinite(places).all():
+        raise FormatError(field, "a number that is not finite", "finite numbers, metres")
+    return places
 
 
 def _point(owner: Anchored | Obstacle, dimension: int) -> Point:

@@ -138,7 +138,7 @@ def _solved(
     return Solved(scenario, nominal, nominal, stack, found, lifted, passing=passed)
 
 
-def warped(full: Solved, below: Nominal, fraction: float, precision: Precision, follower: Follower) -> Solved:
+def warped(full: Solved, below: Nominal, fraction: float, precision: Precision, follower: Follower | None) -> Solved:
     """The motion with every flow run for a fraction of its duration: straight to the goal at 0, in full at 1.
 
     It takes the full motion, at the same precision, and its undisturbed motion, `below`, warped as far.
@@ -148,7 +148,7 @@ def warped(full: Solved, below: Nominal, fraction: float, precision: Precision, 
     """
     stack, scenario = warped_stack(below, full.stack, fraction, precision), replace(full.scenario, warp=fraction)
     avoidance = scenario.arm_avoidance
-    if full.arm is None or avoidance is None:
+    if full.arm is None or avoidance is None or follower is None:
         return Solved(scenario, full.nominal, below, stack, passing=full.passing)
     lifted = follower.behaving(full.nominal, stack, exact=precision is not LIVE)
     arm = follower.whole_arm.warped(full.arm, lifted, avoidance, fraction, precision.spacing)

@@ -10,13 +10,14 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from dt_viz.errors import FormatError
-from dt_viz.files.checks import check_at_least, check_finite
+from dt_viz.files.checks import check_at_least, check_at_most, check_finite
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.obstacles.occupancy import fit_occupancy
 from dt_viz.obstacles.solids import ByContent, Solid
 from dt_viz.obstacles.triangles import grid_nodes
 
-MIN_POINTS = 50
+MIN_POINTS, MAX_POINTS = 50, 100_000
+"""Smallest and largest number of points of a cloud."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ class Cloud(ByContent):
     """Points on or in a solid, or labelled points; compared and hashed by content.
 
     Raises:
-        FormatError: they are too few, or, without labels, the same; or not finite, or wrongly labelled.
+        FormatError: they are too few or too many, or, without labels, the same; or not finite, or wrongly labelled.
     """
 
     points: Array
@@ -76,6 +77,7 @@ class Cloud(ByContent):
 
     def __post_init__(self) -> None:
         self._keep(points=float, labels=float)
+        check_at_most("points", len(self.points), MAX_POINTS)
         check_points(self.points, self.labels)
         if self.labels is None:  # a search among very many points in one place takes the square of their number
             check_at_least("points", len(np.unique(self.points, axis=0)), MIN_POINTS, "different ones")

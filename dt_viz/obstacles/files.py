@@ -18,13 +18,11 @@ from dt_viz.files.checks import check_triangles, checked_suffix
 from dt_viz.files.shapes import Points, Triangles
 from dt_viz.files.uploads import read_upload
 from dt_viz.flows.fields import Array
-from dt_viz.obstacles.clouds import Cloud, check_points
+from dt_viz.obstacles.clouds import MAX_POINTS, Cloud, check_points
 from dt_viz.obstacles.solids import Solid
 
 MAX_BYTES = 20 * 10**6
 """Largest number of bytes of a file."""
-ENOUGH_POINTS = 100_000
-"""Number of points that are used of a cloud; of more, so many are taken at random."""
 MIN_SIZE, MAX_SIZE = 0.01, 1.0
 """Smallest and largest length of the bounding box's longest side, metres."""
 UNITS = {"metres": 1.0, "millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254}
@@ -107,9 +105,9 @@ def read_cloud(
         points, labels, notes = read.points, read.labels, read.notes
         check_points(points, labels)
         points = _in_metres(points, points if labels is None else points[labels > 0.5], source, scale)
-        if len(points) > ENOUGH_POINTS:
-            some = np.sort(np.random.default_rng(0).permutation(len(points))[:ENOUGH_POINTS])
-            notes += (f"{ENOUGH_POINTS} of its {len(points)} points are used, chosen at random",)
+        if len(points) > MAX_POINTS:
+            some = np.sort(np.random.default_rng(0).permutation(len(points))[:MAX_POINTS])
+            notes += (f"{MAX_POINTS} of its {len(points)} points are used, chosen at random",)
             points, labels = points[some], None if labels is None else labels[some]
         cloud = Cloud(np.unique(points, axis=0) if labels is None else points, labels)
         if not cloud.solid.distances.depth > 0:

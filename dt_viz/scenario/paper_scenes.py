@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Mapping
+import re
+from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -310,6 +311,16 @@ SCENES: Mapping[str, PaperScene] = {
     )
 }
 """Scenes by name, in the order of the figures; see `offered`."""
+
+
+def found(name: str, scenes: Iterable[PaperScene]) -> PaperScene | None:
+    """Return the scene of a name, or the first of a figure, such as "fig-4"; None if there is none."""
+
+    def called(scene: PaperScene) -> bool:
+        title = re.sub(r"[^a-z0-9]+", "-", scene.title.lower())
+        return name == scene.name or f"{title}-".startswith(f"{name.lower()}-")
+
+    return next(filter(called, scenes), None)
 
 
 def offered(tasks: Container[str], *, jaco: bool = True) -> tuple[PaperScene, ...]:

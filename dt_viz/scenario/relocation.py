@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 
 from dt_viz.avoidance.avoidance import Avoidance
-from dt_viz.avoidance.transform import Anchored, Transform
+from dt_viz.avoidance.registry import entry_of
+from dt_viz.avoidance.transform import Anchored, Planar, Transform
+from dt_viz.errors import FormatError
 from dt_viz.flows.fields import Array, Mask
-from dt_viz.obstacles.shapes import Box, Cylinder, Obstacle, Point, Sphere, as_point
+from dt_viz.flows.rotations import turned
+from dt_viz.obstacles.shapes import Box, Cylinder, Obstacle, Point, Sphere, as_point, as_quaternion
 from dt_viz.scenario.scenario import MAX_DIAMETER, MIN_DIAMETER, Layer, Scenario, Start
-from dt_viz.scenario.tasks import Task
+from dt_viz.scenario.tasks import OWN, Task
 
+SIZES = ("diameter", "height", "sizes", "scale")
+"""Fields of obstacles that are lengths."""
 DIGITS = 7
 """Decimal places that lengths are rounded to, metres: there and back is the same to the last bit."""
 
@@ -64,6 +69,51 @@ class Relocation:
         return transform
 
 
+def in_world(task: Task) -> tuple[Layer, ...]:
+    """Return the layers that a task begins with, in the world, named as the page names them.
+
+    Raises:
+        FormatError: a transform is of a kind whose places and lengths are not known, and the task lies elsewhere.
+    """
+    layers: list[Layer] = []
+    for layer in task.layers:
+        entry = entry_of(layer.transform)
+        number = 1 + sum(entry_of(other.transform) is entry for other in layers)
+        name = entry.title if entry.most == 1 else f"{entry.title} {number}"
+        layers.append(Layer(_in_world(layer.transform, task), layer.on, name))
+    return tuple(layers)
+
+
+def _in_world(transform: Transform, task: Task) -> Transform:
+    if task.scale == 1 and not task.origin.any() and np.array_equal(task.axes, np.eye(3)):
+        return transform
+    place = lambda point: as_point(task.to_world(np.array(point)))  # noqa: E731
+    changes: dict[str, Any] = {}
+    if isinstance(transform, Planar) and transform.plane is not None:
+        u, v = (as_point(task.axes @ np.array(axis)) for axis in transform.plane)
+        changes["plane"] = u, v
+    if isinstance(transform, Anchored):
+        radius = transform.radius and task.scale * transform.radius
+        return replace(transform, position=place(transform.position), radius=radius, **changes)
+    if isinstance(transform, Avoidance):
+        parts = (_resized(part, task.scale) for part in transform.obstacles)
+        turns = [as_quaternion(turned(task.axes, np.array(part.wxyz))) for part in transform.obstacles]
+        obstacles = tuple(part.moved(place(part.position), turn) for part, turn in zip(parts, turns, strict=True))
+        return replace(transform, obstacles=obstacles, margin=task.scale * transform.margin, **changes)
+    raise FormatError("transform", type(transform).__name__, "obstacles and bias points on a drawing")
+
+
+def _resized(obstacle: Obstacle, scale: float) -> Obstacle:
+    """The obstacle, so many times as large."""
+    changed: Any = obstacle
+    sizes = {field.name: getattr(obstacle, field.name) for field in fields(changed) if field.name in SIZES}
+    return replace(changed, **{name: _scaled(size, scale) for name, size in sizes.items()})
+
+
+def _scaled(size: float | tuple[float, ...], scale: float) -> float | tuple[float, ...]:
+    return tuple(scale * side for side in size) if isinstance(size, tuple) else scale * size
+
+
 def relocated(
     scenario: Scenario, before: Task, after: Task, reaches: Callable[[Array], Mask]
 ) -> tuple[Scenario, tuple[str, ...]]:
@@ -98,3 +148,15 @@ def relocated(
 
 def _stays(layer: Layer, is_there: Callable[[Point], bool]) -> bool:
     return not isinstance(layer.transform, Anchored) or is_there(layer.transform.position)
+
+
+def changes_of_place(arm: str, before: Task, after: Task, gone: Sequence[str]) -> str:
+    """Return what a visitor is told of `relocated`, for the arm of a title; empty where there is nothing to say."""
+    said = []
+    if after.name.startswith(OWN) and (after.scale, *after.origin) != (before.scale, *before.origin):
+        said.append(
+            f"“{after.title}” is moved to where the {arm} follows it, {after.scale / before.scale:.2g} × as large."
+        )
+    if gone:
+        said.append(f"Out of reach of the {arm}, and left out: {', '.join(gone)}.")
+    return " ".join(said)

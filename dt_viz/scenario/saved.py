@@ -1,4 +1,4 @@
-"""Saved scenarios: what a visitor has made, as a text of some kB that is checked like a file from a stranger.
+"""Saved scenarios: what a visitor has made, as a text that is checked like a file from a stranger.
 
 The text is JSON, one object:
 
@@ -9,10 +9,14 @@ The text is JSON, one object:
     is its field `view`.
 `camera`
     Position and look-at of the camera, metres; null is the view that the task begins with.
+`own`
+    The task where it does not ship with DT-Viz, whose name then is "own_data"; see `Own`. Otherwise null.
+`arrays`
+    Arrays by their names: demonstrations and shapes from files; see `dt_viz.files.texts`. It is left out if there are
+    none.
 
 Objects are written by their fields, with the name of their class; fields that are left out have their defaults. Shapes
-of the paper's figures are written by their names (`Figure`). Shapes from files are too large and a visitor's own
-demonstrations are tasks of his alone: `portable` leaves out the former, and `decode` refuses the latter.
+of the paper's figures are written by their names (`Figure`). Version 1 had no `own` and no `arrays`.
 """
 
 from __future__ import annotations
@@ -22,31 +26,30 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from dt_viz.avoidance.avoidance import Avoidance
 from dt_viz.avoidance.page import Choice, FlowIntegration, Number
 from dt_viz.avoidance.registry import KINDS, entry_of
 from dt_viz.avoidance.transform import Anchored, Transform
-from dt_viz.errors import DataError, FormatError, check_between, parsing
-from dt_viz.files.checks import check_at_most
+from dt_viz.errors import DataError, FormatError, check_between, naming, parsing
+from dt_viz.files.checks import check_at_most, check_size
+from dt_viz.files.texts import decoded, encoded
 from dt_viz.files.values import packed, unpacked
 from dt_viz.flows.diffeomorphisms import MAX_STEPS
 from dt_viz.obstacles.clouds import Cloud
 from dt_viz.obstacles.shapes import (
+    SHAPES,
     UPRIGHT,
-    Box,
     CloudObstacle,
-    Cylinder,
     MeshObstacle,
     Obstacle,
     Point,
     Quaternion,
-    Sphere,
     TriangleObstacle,
 )
 from dt_viz.obstacles.solids import Solid
+from dt_viz.scenario.own import Own
 from dt_viz.scenario.paper_scenes import CLOVER, bottle, offered
 from dt_viz.scenario.scenario import (
     MAX_DISTANCE,
@@ -60,15 +63,20 @@ from dt_viz.scenario.scenario import (
     Layer,
     Scenario,
 )
-from dt_viz.scenario.tasks import STYLES
+from dt_viz.scenario.tasks import OWN, STYLES
 
-FORMAT = 1
-"""Version of the text; raised where texts from before cannot be read any more. A new field that has a default does not
-need that."""
-MAX_BYTES = 64 * 1000
+FORMAT = 2
+"""Version of the text; raised where versions from before could not read it."""
+READ = (1, FORMAT)
+"""Versions that are read."""
+MAX_BYTES = 16 * 10**6
 """Largest number of bytes of a text."""
+MAX_PLAIN = 300_000
+"""Largest number of bytes of all but its arrays: so much is checked within a second."""
 SIZES = (0.002, 2.0)
 """Smallest depth and largest radius of an obstacle, metres: beyond the page's sliders, as scenes scale with the arm."""
+THINNEST = 1e-4
+"""Smallest depth of an obstacle from a file, metres."""
 ROOM = 5.0
 """Factor by which other lengths may be beyond the page's sliders, for the same reason."""
 SCALES = (0.02, 20.0)
@@ -97,6 +105,8 @@ class Saved:
     scenario: Scenario
     camera: Sight | None = None
     """None where the camera shows what the task begins with."""
+    own: Own | None = None
+    """The scenario's task where its demonstrations are not those of a known one."""
 
 
 @dataclass(frozen=True)
@@ -104,9 +114,10 @@ class Known:
     """Names that a scenario may have."""
 
     tasks: Collection[str]
-    arms: Collection[str] = ("",)
-    methods: Collection[str] = ()
-    """Names of methods that ours is compared with."""
+    arms: Collection[str] | None = ("",)
+    """Names of arms; None are any."""
+    methods: Collection[str] | None = ()
+    """Names of methods that ours is compared with; None are any."""
 
 
 @dataclass(frozen=True)
@@ -128,42 +139,76 @@ class Figure:
         return made
 
 
-SMALL = (Sphere, Box, Cylinder)
-"""Obstacles that are written by their numbers."""
+def is_saved(content: bytes) -> bool:
+    """Return whether the content of a file says that it is a saved scenario, whether or not it can be read."""
+    return re.search(rb'"class"\s*:\s*"Saved"', content) is not None
 
 
 def portable(scenario: Scenario) -> tuple[Scenario, int]:
     """Return a scenario without obstacles whose shapes come from files, and how many these were."""
-    left = _with_obstacles(scenario, lambda obstacle: obstacle if _small(obstacle) is not None else None)
+    left = _with_obstacles(scenario, lambda obstacle: None if _is_from_file(_named(obstacle)) else obstacle)
     return left, len(scenario.obstacles) - len(left.obstacles)
 
 
 def encode(saved: Saved) -> str:
-    """Return what is saved as text, which `decode` reads back to the last bit; the scenario must be `portable`."""
-    scenario = replace(_with_obstacles(saved.scenario, _small), passing=None)
-    plain = {"version": FORMAT, **packed(replace(saved, scenario=scenario), "saved", {})}
-    del plain["scenario"]["passing"]
-    return msgspec.json.encode(plain, enc_hook=lambda number: number.item()).decode()  # numpy's
-
-
-def decode(text: str, known: Known, source: str = "scenario") -> Saved:
-    """Read what `encode` wrote; `source` names the text in messages.
+    """Return what is saved as text, which `decode` reads back to the last bit.
 
     Raises:
-        ScenarioError: it is too large, is no such text, or has a value that no page of these tasks, arms and methods
+        ScenarioError: the text would be larger than `MAX_BYTES`.
+    """
+    scenario, arrays = replace(_with_obstacles(saved.scenario, _named), passing=None), dict[str, np.ndarray]()
+    if saved.own is not None:
+        scenario = replace(scenario, task=OWN)
+    plain = {"version": FORMAT, **packed(replace(saved, scenario=scenario), "saved", arrays)}
+    del plain["scenario"]["passing"]
+    content = encoded(plain, arrays)
+    with naming(ScenarioError, "scenario"):
+        check_size(len(content), MAX_BYTES)
+    return content.decode()
+
+
+def decode(text: str | bytes, known: Known, source: str = "scenario") -> Saved:
+    """Read what `encode` wrote; `source` names the text in messages.
+
+    The shapes of obstacles are checked by `check_shapes`, which takes longer.
+
+    Raises:
+        DataError: it is too large, is no such text, or has a value that no page of these tasks, arms and methods
             gives, which is named. Nothing else is raised, whatever the text holds.
     """
     with parsing(ScenarioError, source, "text", "a scenario that DT-Viz saved"):
-        content = text.encode()
-        check_at_most("text", len(content), MAX_BYTES, "bytes")
-        plain = msgspec.json.decode(content)
-        version = plain.pop("version", None) if isinstance(plain, dict) else None
-        if version != FORMAT:
-            raise FormatError("version", repr(version)[:40], f"{FORMAT}; another version of DT-Viz may have saved it")
-        saved: Saved = unpacked(plain, Saved, "saved", {}, {Transform: KINDS, Obstacle: (*SMALL, Figure)})
+        content = text.encode() if isinstance(text, str) else text
+        fields = "version", "class", *Saved.__dataclass_fields__
+        plain, arrays = decoded(content, fields, max_bytes=MAX_BYTES, max_plain=MAX_PLAIN)
+        version = plain.pop("version", None)
+        if version not in READ or isinstance(version, bool):
+            accepted = f"{' or '.join(map(str, READ))}; another version of DT-Viz may have saved it"
+            raise FormatError("version", repr(version)[:40], accepted)
+        saved: Saved = unpacked(plain, Saved, "saved", arrays, {Transform: KINDS, Obstacle: (*SHAPES, Figure)})
+        if arrays:
+            raise FormatError("arrays", f"{next(iter(arrays))[:40]!r}, which nothing is made of", "those that are used")
         saved = replace(saved, scenario=_with_obstacles(saved.scenario, _whole))
+        if saved.own is not None:
+            saved, known = replace(saved, own=saved.own.checked(source)), replace(known, tasks=(*known.tasks, OWN))
+            _check_named("task", saved.scenario.task, (OWN,))
         _check(saved, known)
         return saved
+
+
+def check_shapes(scenario: Scenario, source: str = "scenario") -> None:
+    """Check that obstacles from files are solids of a sensible size, and make them ready to be shown.
+
+    It takes about a second for each shape.
+
+    Raises:
+        ScenarioError: one is none, such as an open mesh.
+    """
+    with parsing(ScenarioError, source, "shape of an obstacle", "a closed mesh, or points that something occupies"):
+        for obstacle in scenario.obstacles:
+            if isinstance(obstacle, TriangleObstacle):
+                check_between("radius of an obstacle", obstacle.radius, *SIZES)
+                check_between("depth of an obstacle", obstacle.depth, THINNEST, SIZES[1])
+                obstacle.surface()
 
 
 def _with_obstacles(scenario: Scenario, change: Callable[[Any], Any]) -> Scenario:
@@ -178,13 +223,17 @@ def _with_obstacles(scenario: Scenario, change: Callable[[Any], Any]) -> Scenari
     return replace(scenario, stack=tuple(map(changed, scenario.stack)))
 
 
-def _small(obstacle: Obstacle) -> Any:  # noqa: ANN401 - an obstacle, or its stand-in
-    """The obstacle by its numbers, or by the name of its shape; None if that is from a file."""
+def _named(obstacle: Obstacle) -> Any:  # noqa: ANN401 - an obstacle, or its stand-in
+    """The obstacle, by the name of its shape where that ships."""
     if not isinstance(obstacle, MeshObstacle | CloudObstacle):
         return obstacle
     shape = obstacle.mesh if isinstance(obstacle, MeshObstacle) else obstacle.cloud
     name = next((name for name, shipped in SHIPPED.items() if shape == shipped()), None)
-    return name and Figure(obstacle.position, name, obstacle.wxyz, obstacle.scale)
+    return obstacle if name is None else Figure(obstacle.position, name, obstacle.wxyz, obstacle.scale)
+
+
+def _is_from_file(obstacle: Any) -> bool:  # noqa: ANN401 - as `_named` returns
+    return isinstance(obstacle, MeshObstacle | CloudObstacle)
 
 
 def _whole(obstacle: Any) -> Obstacle:  # noqa: ANN401
@@ -198,11 +247,11 @@ def _check(saved: Saved, known: Known) -> None:
         raise FormatError("passing", "one", "none: it is decided anew")
     scenes = [scene.name for scene in offered(known.tasks) if scene.task == scenario.task]
     _check_named("task", scenario.task, known.tasks)
-    _check_named("arm", scenario.arm, known.arms)
+    _check_named("arm", scenario.arm, (scenario.arm,) if known.arms is None else known.arms)
     _check_named("scene", scenario.scene, ("", *scenes))
     _check_named("style", scenario.style, ("", *STYLES))
     for name in (*view.compared, view.their_arm):
-        _check_named("compared method", name, ("", *known.methods))
+        _check_named("compared method", name, ("", *((name,) if known.methods is None else known.methods)))
     for panel in view.panels:
         _check_named("task of a panel", panel.task, ("", *known.tasks))
     counts = {

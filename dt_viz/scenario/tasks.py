@@ -17,8 +17,9 @@ from dt_viz.learning.inspection import PreparationSettings
 from dt_viz.learning.interface import AnyImitation, State
 from dt_viz.metrics import resample_by_arc_length
 from dt_viz.numerics import unit
-from dt_viz.obstacles.shapes import as_point
+from dt_viz.obstacles.shapes import Point, as_point
 from dt_viz.scenario.objects import Ball, LiftedBox, Pot, PushedBox, TaskObject
+from dt_viz.scenario.scenario import Layer
 from dt_viz.scenario.slices import Slice
 from dt_viz.shipped import ASSETS
 
@@ -35,6 +36,8 @@ DRAWING_SIZE = 0.40
 OWN = "own_data"
 """Name of the task that `own_task` makes."""
 
+Move = tuple[float, Point]
+"""Scale and shift, metres, of a placement."""
 POTS = (Pot(-0.16, -0.52), Pot(0.0, -0.52), Pot(0.16, -0.52))
 """Pots of `drop_pots`: left, centre and right as seen facing the robot."""
 
@@ -76,6 +79,12 @@ class Task:
     """What was found about the demonstrations and shown before they were learned: it is no warning any more."""
     size: float = 1.0
     """Scale at which `placed` has put it, and at which what is added to it is made."""
+    moves: tuple[Move, ...] = ()
+    """How `placed` has put it, one after the other."""
+    imitation: AnyImitation | None = None
+    """What was learned from the demonstrations, in its state; None is learned here."""
+    layers: tuple[Layer, ...] = ()
+    """Transforms that it begins with, in the frame of the demonstrations; without any it is a sphere to avoid."""
 
     def to_world(self, points: Array) -> Array:
         """Transform points (*B, k) of the demonstrations to the world, (*B, 3), metres."""
@@ -102,6 +111,7 @@ class Task:
             camera=(eye, target),
             obstacle_position=as_point(mapped(self.obstacle_position)),
             size=scale * self.size,
+            moves=(*self.moves, (float(scale), (x, y, z))),
             hint="Drag the sphere into the way." if z and self.on_table else self.hint,
             pots=() if z else tuple(pot.placed(scale, x, y) for pot in self.pots),
             objects=() if z else tuple(one.placed(scale, x, y) for one in self.objects),

@@ -9,14 +9,13 @@ import numpy as np
 
 from dt_viz.avoidance.avoidance import Avoidance
 from dt_viz.errors import Cancelled, never
-from dt_viz.learning.augmented import AugmentedImitation, fit_augmented
-from dt_viz.learning.imitation import ImitationSettings, Progress
-from dt_viz.learning.patterns import AugmentedSettings
+from dt_viz.learning.augmented import AugmentedImitation
+from dt_viz.learning.imitation import Progress
 from dt_viz.learning.store import FitStore
-from dt_viz.learning.style import Style
 from dt_viz.memo import Memo, kept
 from dt_viz.motion.certificates import Certificates, DrawnSamples
 from dt_viz.motion.following import NEWEST, Admission, ArmMotion, Follower, far_starts, unreachable
+from dt_viz.motion.learned import augmented_of, learned_of, styled
 from dt_viz.motion.nominal import Learned, Nominal, NominalTrajectory
 from dt_viz.motion.profiles import profiles
 from dt_viz.motion.solve import Solved, solve, warped
@@ -182,32 +181,23 @@ class Engine:
         return self._learn(scenario, self.own[scenario.task][1], progress)
 
     def _learn(self, scenario: Scenario, fits: FitStore, progress: Progress | None) -> Learned:
-        task = self.task(scenario.task)
-        state = task.state if scenario.state == "auto" else scenario.state
-        state = state if scenario.imitation else "plain"  # without it there is nothing to remember
-        settings = ImitationSettings(scenario.objective, preparation=task.preparation)
-        imitation = fits.learned(task.demonstrations, settings, state, progress)
-        if imitation.state == "augmented" and scenario.state == "auto" and not imitation.reason:
-            imitation = replace(imitation, reason="the plain state misses a demonstration of this task")
-        learned = Learned.of(task, imitation, imitates=scenario.imitation)
+        learned = learned_of(scenario, self.task(scenario.task), fits, progress)
+        imitation = learned.imitation
         if isinstance(imitation, AugmentedImitation) and learned.poses and self.follower.unreached(learned):
             places = replace(imitation, goal_orientation=None, warnings=(*imitation.warnings, NOT_TURNED))
-            alone = Learned.of(task, places, imitates=scenario.imitation)
+            alone = Learned.of(learned.task, places, imitates=scenario.imitation)
             return learned if self.follower.unreached(alone) else alone
         return learned
 
     @kept(NEWEST, by=lambda task: task)
     def _augmented(self, task: str) -> AugmentedImitation:
-        of = self.task(task)
-        return fit_augmented(of.demonstrations, settings=AugmentedSettings(preparation=of.preparation))
+        return augmented_of(self.task(task))
 
     @kept(NEWEST, by=lambda scenario: scenario.learned)
     def _styled(self, scenario: Scenario) -> Learned:
         """What is learned for a scenario in the augmented state, in its style."""
-        tasks = scenario.task, *STYLES[scenario.style]
-        own, usual, other = (self._augmented(task) for task in tasks)
-        imitation = Style.between(usual, other).on(own, scenario.style_amount)
-        return Learned.of(self.task(scenario.task), imitation, imitates=True)
+        own, usual, other = (self._augmented(task) for task in (scenario.task, *STYLES[scenario.style]))
+        return styled(self.task(scenario.task), own, usual, other, scenario.style_amount)
 
     def _admission(self, scenario: Scenario, precision: Precision) -> Admission:
         """Whether the scenario has a motion, and from which starts.

@@ -17,10 +17,10 @@ from dt_viz.learning.imitation import ImitationError
 from dt_viz.robot.placement import is_jaco
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.paper_scenes import SCENES
-from dt_viz.scenario.relocation import relocated
+from dt_viz.scenario.relocation import changes_of_place, relocated
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import IMITATION, as_fresh
-from dt_viz.scenario.tasks import OWN, Task
+from dt_viz.scenario.tasks import Task
 from dt_viz.session.arms import Engines, NewEngine
 from dt_viz.session.engine import Engine, wake
 from dt_viz.session.frame import Frame, Stage
@@ -155,17 +155,23 @@ class Session:
         Raises:
             DemonstrationError: its demonstrations cannot be used; the session stays with its task.
         """
-        if name != self.scenario.task:
-            fresh = self._initial(self.engine, name)
-            if self.scenario.scene:  # of the paper: leaves nothing behind
-                self._begin("task", self._as_seen(fresh))
-                return
-            stack, view = as_fresh(self.scenario, fresh), replace(self.scenario.view, slice=None)
+        if name == self.scenario.task:
+            return
+        if self.scenario.scene:  # of the paper: leaves nothing behind
+            self.begin_task(name)
+        else:
+            fresh, view = self._initial(self.engine, name), replace(self.scenario.view, slice=None)
+            stack = as_fresh(self.scenario, fresh)
             self.step("task", task=name, arm_rollout=0, starts=fresh.starts, stack=stack, view=view)
 
-    def bring(self, task: Task) -> tuple[Task, str | None]:
-        """Take a task of the visitor's own, to be chosen; see `Engine.bring`."""
-        own, gone = self.engine.bring(task, self.scenario.task)
+    def begin_task(self, name: str) -> None:
+        """Begin with a task as it begins, seen as what is shown now; can be undone. Raises as `choose_task`."""
+        self._begin("task", self._as_seen(self._initial(self.engine, name)))
+
+    def bring(self, task: Task, arm: str | None = None) -> tuple[Task, str | None]:
+        """Take a visitor's own task, of an arm or the present one; see `Engine.bring`. Raises as `choose_arm`."""
+        engine, _ = self._task_of(self.scenario.arm if arm is None else arm, self.scenario.task)
+        own, gone = engine.bring(task, self.scenario.task)
         if gone is not None:
             with self._lock:
                 self._history.forget(gone)
@@ -189,15 +195,8 @@ class Session:
             there = replace(there, stack=scene.scenario(after).stack)
         changes = ("scene", "stack", "starts", "view", "arm_rollout")
         self.step("arm", anew=True, arm=name, **{field: getattr(there, field) for field in changes})
-        arm, said = engine.follower.robot.title, []
-        if self.scenario.task.startswith(OWN) and (after.scale, *after.origin) != (before.scale, *before.origin):
-            said.append(
-                f"“{after.title}” is moved to where the {arm} follows it, {after.scale / before.scale:.2g} × as large."
-            )
-        if gone:
-            said.append(f"Out of reach of the {arm}, and left out: {', '.join(gone)}.")
-        if said:
-            self.say(" ".join(said), Severity.NOTE)
+        if text := changes_of_place(engine.follower.robot.title, before, after, gone):
+            self.say(text, Severity.NOTE)
 
     def restore(self, scenario: Scenario) -> None:
         """Go on with a scenario from before, of any arm; called on the lane `CHOICES`. Raises as `choose_arm`."""
@@ -229,7 +228,7 @@ class Session:
     def leave_scene(self) -> None:
         """Back to how the task of the scene begins; can be undone. Nothing is done while there is no scene."""
         if self.scenario.scene:
-            self._begin("scene", self._as_seen(self._initial(self.engine, self.scenario.task)))
+            self.begin_task(self.scenario.task)
 
     def load(self, task: str, scenario: Callable[[Task], Scenario]) -> None:
         """Begin with a scenario for a task, seen as its scene wants it, or else as what is shown now; can be undone.
@@ -246,8 +245,7 @@ class Session:
     def _as_seen(self, other: Scenario) -> Scenario:
         """Another scenario, looked at as this one, on the slice that it had.
 
-        If it is of a scene of the paper that this is not of, or the other way round, it is looked at as it was itself,
-        but for habits.
+        If one of them is of a scene of the paper, and the other is not, it is looked at as it was, but for habits.
         """
         view = self.scenario.view
         if other.scene == self.scenario.scene:
@@ -268,8 +266,7 @@ class Session:
         """Stop learning a task, or loading an arm, and go back to what was shown; nothing is done without either."""
         with self._lock:
             abandoned, shown = self.scenario, self._shown
-            learning = self._screen.progress.learning is not None
-            if not learning or (shown is not None and abandoned.fit == shown.scenario.fit):
+            if self._screen.progress.learning is None or (shown is not None and abandoned.fit == shown.scenario.fit):
                 self.jobs.submit(CHOICES, lambda: None, latest=True)  # of an arm, which is not the scenario's yet
                 return
             self._stopped = not self._retreat(abandoned)
@@ -277,9 +274,8 @@ class Session:
         instead = "Choose another task, or move the obstacle to start again."
         if shown is not None:
             instead = f"This is “{self.task.title}” as before."
-        title = self.engine.title(abandoned.task)
         self._screen.tell(learning=None)
-        self.say(f"Learning “{title}” was cancelled. {instead}", Severity.WARNING)
+        self.say(f"Learning “{self.engine.title(abandoned.task)}” was cancelled. {instead}", Severity.WARNING)
 
     def expect(self, expected: bool) -> None:
         """Take note that another task or scene is being read for this session, or no more."""
@@ -340,8 +336,8 @@ class Session:
         if engine is not None:
             engine.see(self.scenario)
         self._num_edits += 1
-        compute = partial(self._compute, self.scenario, time.perf_counter())
-        self._num_skipped += self.jobs.submit(LANE, compute, latest=True)
+        work = partial(self._compute, self.scenario, time.perf_counter())
+        self._num_skipped += self.jobs.submit(LANE, work, latest=True)
 
     def _compute(self, scenario: Scenario, edited: float) -> None:
         """Show the frames of a scenario that was wanted at a time, of `time.perf_counter`."""

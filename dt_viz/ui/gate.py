@@ -22,7 +22,7 @@ import math
 import socket
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from http import HTTPStatus
 from typing import Any, get_type_hints
@@ -32,12 +32,12 @@ import viser
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
-from dt_viz.errors import DataError, naming
-from dt_viz.files.checks import check_size
+from dt_viz.errors import DataError
 from dt_viz.serving.board import Share, own_share
 from dt_viz.serving.reports import REPORTS, Report
 from dt_viz.ui import patches, scripts
 from dt_viz.ui.origins import Origins, address_of
+from dt_viz.ui.transfers import MalformedError, Upload
 
 logger = logging.getLogger(__name__)
 
@@ -69,7 +69,7 @@ KINDS: Mapping[str, str] = {
     "SceneNodeDragMessage": "message",
     "ScenePointerMessage": "message",
     "GetRenderResponseMessage": "image",
-    STORED: "message",
+    STORED: "part",
     "FileTransferStartUpload": "message",
     "FileTransferPart": "part",
 }
@@ -105,66 +105,9 @@ class Limits:
     message: int = 64 * 1024
     """Largest size of most messages, bytes."""
     part: int = 2**20
-    """Largest size of a message with a part of a file, bytes; the page sends half of it."""
+    """Largest size of a message with a part of a file, of which the page sends half, or with what was kept, bytes."""
     image: int = 16 * 2**20
     """Largest size of a message with a rendered image, bytes, and so of any."""
-
-
-class MalformedError(ValueError):
-    """A message that the page never sends."""
-
-
-@dataclass
-class Upload:
-    """The file that one visitor is sending, counted before any of it is held: one at a time."""
-
-    max_bytes: int
-    """Largest size that may be announced, bytes."""
-    max_parts: int = 1024
-    uuid: str = ""
-    """Name of the transfer under way; none if empty."""
-    num_bytes: int = 0
-    """Announced size, bytes."""
-    num_parts: int = 0
-    """Announced number of parts."""
-    num_arrived: int = 0
-    """Size of what has arrived, bytes."""
-    arrived: set[int] = field(default_factory=set)
-    """Numbers of the parts that have arrived."""
-
-    def start(self, uuid: str, name: str, num_bytes: int, num_parts: int) -> None:
-        """Begin a file that is announced; an incomplete one before it has been given up.
-
-        Raises:
-            DataError: it is too large; the message is for the user.
-            MalformedError: no file of that size has so many parts.
-        """
-        self.uuid = ""
-        with naming(DataError, name):
-            check_size(num_bytes, self.max_bytes)
-        if num_bytes < 0 or not min(num_bytes, 1) <= num_parts <= min(num_bytes, self.max_parts):
-            raise MalformedError(f"{num_parts} parts for {num_bytes} bytes")
-        self.uuid = uuid if num_parts else ""
-        self.num_bytes, self.num_parts, self.num_arrived, self.arrived = num_bytes, num_parts, 0, set()
-
-    def part(self, uuid: str, index: int, num_bytes: int) -> bool:
-        """Count a part that arrives; return whether it belongs to the announced file.
-
-        Raises:
-            MalformedError: it has arrived before, or the parts do not add up to the announced size.
-        """
-        if not self.uuid or self.uuid != uuid:
-            return False
-        if index in self.arrived or not 0 <= index < self.num_parts:
-            raise MalformedError(f"part {index} of {self.num_parts}")
-        self.arrived.add(index)
-        self.num_arrived += num_bytes
-        complete = len(self.arrived) == self.num_parts
-        if self.num_arrived > self.num_bytes or (complete and self.num_arrived < self.num_bytes):
-            raise MalformedError(f"{self.num_arrived} bytes of {self.num_bytes}")
-        if complete:
-            self.uuid = ""
-        return True
 
 
 class _Value(msgspec.Struct, forbid_unknown_fields=True):
@@ -227,7 +170,7 @@ class Gate:
         origins: Origins,
         limits: Limits,
         refused: Refused,
-        measured: scripts.Measured = lambda _token, _width: None,
+        told: scripts.Told = lambda _token, _what: None,
         share: Share | None = None,
     ) -> None:
         """Prepare the checks.
@@ -236,14 +179,14 @@ class Gate:
             origins: pages that may connect.
             limits: limits of what visitors send.
             refused: called with a visitor and the reason when a file is not accepted.
-            measured: called with what a `Ruler` measures. It must only take note.
+            told: called with what a `Ruler` measures and reads. It must only take note.
             share: what other processes for the same address tell; None if there are none.
 
         Raises:
             GateError: viser's messages differ from the expected ones.
         """
         self.limits = limits
-        self._origins, self._refused, self._measured = origins, refused, measured
+        self._origins, self._refused, self._told = origins, refused, told
         self._share = share or own_share(limits.connections)
         self._connections: dict[ServerConnection, tuple[int, str]] = {}
         """The connections here, the number of each on the board, and its `address_of`."""
@@ -311,7 +254,7 @@ class Gate:
             logger.warning("a request was refused: %s", refusal[1])
             return connection.respond(*refusal)
         if (told := scripts.told(request.path)) is not None:
-            self._measured(*told)
+            self._told(*told)
             return connection.respond(HTTPStatus.NO_CONTENT, "")
         if (report := REPORTS.get(request.path)) is not None:
             response = _response(connection, report(self._share, self.limits.places))

@@ -6,16 +6,17 @@ in time all the same, and says once what is wrong.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import Protocol
 
 from dt_viz.errors import DataError
-from dt_viz.scenario.saved import Known, Saved, Sight, decode, encode, portable
+from dt_viz.scenario.saved import Known, Saved, ScenarioError, Sight, decode, encode, portable
+from dt_viz.scenario.scenario import Scenario
 from dt_viz.session.frame import Frame, Stage
-from dt_viz.session.session import Session
+from dt_viz.session.session import CHOICES, Session
 from dt_viz.warning import Severity
 
 KEY = "dt-viz"
@@ -25,14 +26,16 @@ PATIENCE = 1.0
 ATTEMPTS = 30
 """Number of times that it is asked again after the page has opened, while nothing is edited."""
 PAUSE = 0.5
-"""Shortest time between two writes, seconds."""
+"""Shortest time between two writes of a text up to `SMALL`, seconds; longer texts take in proportion longer."""
+SMALL, MAX_KEPT = 100_000, 10**6
+"""Numbers of bytes of a text that is quickly sent, and of the largest that is kept."""
 LANE = "keeping"
 """Lane of the session's jobs on which the browser is asked and told."""
-SLOW = "This browser has not told yet what it keeps: the page begins anew, or goes on with it when it comes."
+SLOW = "This browser has not told yet what it keeps: the page goes on with it when it comes, unless you edit before."
 BLOCKED = "This browser keeps nothing: after a reload, the page begins anew."
 FULL = "This browser has no room left to keep what you do: after a reload, the page begins as before."
-OWN_TASK = "Your own demonstrations are not kept in this browser: after a reload, open them again."
-OWN_SHAPES = "Obstacles from files are not kept in this browser: after a reload, add them again."
+OWN_TASK = "Demonstrations as large as yours are not kept in this browser: save the scenario, and open that file again."
+OWN_SHAPES = "Obstacles as large as yours are not kept in this browser: save the scenario, and open that file again."
 
 
 class Storage(Protocol):
@@ -51,13 +54,14 @@ class Storage(Protocol):
 class Keeper:
     """Keeps the scenario and the camera of one visitor in his browser: the newest, at most twice a second."""
 
-    def __init__(self, storage: Storage, known: Known, present: Callable[[], Saved]) -> None:
+    def __init__(self, storage: Storage, known: Known, present: Callable[[Collection[str]], Saved]) -> None:
         """Ask the browser what it keeps, for `PATIENCE` at most.
 
         Args:
             storage: what the browser keeps.
             known: names of what there is on this page.
-            present: says what is there now; asked once there is a session.
+            present: says what is there now, with the task's demonstrations if it is none of some names; asked once
+                there is a session.
         """
         self._storage, self._known, self._present = storage, known, present
         self._session: Session | None = None
@@ -69,20 +73,36 @@ class Keeper:
         """Text that was written last, or that needs no writing."""
         self._proven = False
         """Whether the browser was asked if it keeps what it is told."""
+        self._first: Scenario | None = None
+        """Scenario that the page shows until it goes on with what the browser keeps; None if it does, or need not."""
         self.begun: Saved | None = None
-        """What the page begins with; None if it begins anew, or has begun."""
-        self._ask()
+        """What the page begins with, or goes on with; None if it begins anew, or has begun."""
+        self._attempts = 0 if self._ask() else ATTEMPTS
+        """Number of times that the browser is still asked; 0 once it has told."""
 
     def begin(self, session: Session, resume: Callable[[Saved], None]) -> None:
-        """Keep what is there, from now on, when it is `changed`; `resume` takes what the browser tells late."""
+        """Keep what is there, from now on, when it is `changed`.
+
+        `resume` goes on with what the browser tells late, or the session has not begun with. Until then only an edit is
+        written in its place, not what the camera reports.
+        """
         trouble = tuple(self._said)
         self._written = self._text()
         for text in trouble:
             session.say(text, Severity.WARNING)
-        if BLOCKED not in trouble:
-            self._session = session
-        if SLOW in trouble:
-            session.jobs.submit(LANE, partial(self._ask_again, session, resume))
+        if BLOCKED in trouble:
+            return
+        self._session, self._resume = session, resume
+        late = None if self.begun is None or self.begun.scenario == session.scenario else self.begun
+        if late is not None or self._attempts:
+            self._first = session.scenario
+        if late is not None:
+            resume(late)
+        self.changed()
+
+    def go_on(self, saved: Saved) -> None:
+        """Take note of what the page goes on with."""
+        self.begun = saved
 
     def sight(self, frame: Frame) -> Sight | None:
         """Return where the camera begins with a frame; None where its task says it."""
@@ -93,14 +113,19 @@ class Keeper:
             self.begun = None
         return begun.camera
 
+    def read(self, content: bytes, source: str) -> Saved:
+        """Read a scenario from the content of a file; see `decode`."""
+        return decode(content, self._known, source)
+
     def changed(self) -> None:
         """Keep what is there now, soon. Never blocks for long."""
-        if self._session is not None:
-            self._session.jobs.submit(LANE, partial(self._write, self._session), latest=True)
+        if self._session is not None:  # the newest of these does what those before it would have done
+            self._session.jobs.submit(LANE, partial(self._keep, self._session), latest=True)
 
     def forget(self) -> None:
         """Keep nothing until the next edit."""
         if self._session is not None:
+            self._first = None
             self._session.jobs.submit(LANE, self._remove, latest=True)
 
     def _ask(self) -> bool:
@@ -119,14 +144,25 @@ class Keeper:
             self._say(f"The page begins anew. {error}")
         return True
 
-    def _ask_again(self, session: Session, resume: Callable[[Saved], None]) -> None:
-        told, attempts = False, ATTEMPTS
-        while attempts and not told and not session.jobs.superseded(LANE):
-            told, attempts = self._ask(), attempts - 1
-        if self.begun is not None and session.jobs.superseded(LANE):  # it was edited, or the visitor has left
-            self.begun = None
-        elif self.begun is not None:
-            resume(self.begun)
+    def _waits(self, session: Session) -> bool:
+        """Whether the page has still to go on with what the browser keeps: an edit takes its place."""
+        if session.scenario != self._first:
+            self._first = None
+        return self._first is not None
+
+    def _keep(self, session: Session) -> None:
+        """Ask the browser, until it tells, what it keeps, and go on with that; once that is done, write what is new."""
+        while self._attempts and self._waits(session) and not session.jobs.closed:
+            self._attempts -= 1
+            if self._ask():
+                self._attempts = 0
+                session.jobs.wait_idle(CHOICES)  # a task, scene or file that is chosen meanwhile is an edit, too
+                if self.begun is None or not self._waits(session):
+                    self.begun = self._first = None
+                else:
+                    self._resume(self.begun)
+        if not self._waits(session):
+            self._write(session)
 
     def _write(self, session: Session) -> None:
         text = self._text()
@@ -140,18 +176,19 @@ class Keeper:
                 self._proven = True
                 if full:
                     self._say(FULL)
-        session.jobs.pause(PAUSE)
+        session.jobs.pause(PAUSE * max(1.0, len(text) / SMALL))
 
     def _text(self) -> str | None:
         """What is to be written; None where it cannot be, which the visitor is told."""
-        present = self._present()
-        if present.scenario.task not in self._known.tasks:
+        present = self._present(self._known.tasks)
+        small, num_left = portable(present.scenario)
+        if (text := _short(present)) is None and num_left:
+            text = _short(replace(present, scenario=small))
+            if text is not None:
+                self._say(OWN_SHAPES)
+        if text is None:
             self._say(OWN_TASK)
-            return None
-        scenario, num_left = portable(present.scenario)
-        if num_left:
-            self._say(OWN_SHAPES)
-        return encode(replace(present, scenario=scenario))
+        return text
 
     def _remove(self) -> None:
         self._storage.remove_item(KEY)
@@ -163,3 +200,12 @@ class Keeper:
             self._said.append(text)
             if self._session is not None:
                 self._session.say(text, Severity.WARNING)
+
+
+def _short(saved: Saved) -> str | None:
+    """Return what is saved as a text that a browser keeps; None if it is too large for that."""
+    try:
+        text = encode(saved)
+    except ScenarioError:
+        return None
+    return text if len(text.encode()) <= MAX_KEPT else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -11,7 +12,8 @@ import viser
 from dt_viz.avoidance.avoidance import Space
 from dt_viz.robot.placement import is_jaco
 from dt_viz.robot.robot import Robot
-from dt_viz.scenario.paper_scenes import SCENES, PaperScene, offered
+from dt_viz.scenario.paper_scenes import SCENES, PaperScene, found, offered
+from dt_viz.scenario.saved import Saved, check_shapes
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import avoidance_layer, avoiding_with
 from dt_viz.scenario.tasks import Task
@@ -23,6 +25,7 @@ from dt_viz.ui.controls import Control
 from dt_viz.ui.scene.camera import CameraController
 from dt_viz.ui.scene.legend import Legend
 from dt_viz.ui.scene.palette import Colour
+from dt_viz.ui.scripts import Link
 from dt_viz.ui.tabs.about import Command, add_about, add_commands, numbered
 from dt_viz.ui.tabs.arm import add_arm, play_or_pause
 from dt_viz.ui.tabs.compare import ComparePanel
@@ -38,6 +41,7 @@ MAX_UPLOAD = 50 * 10**6
 """Largest number of bytes of what a visitor sends."""
 NO_SCENE = "–"
 OFF = "Off"
+SAVE_HINT = "Save: all that you have made, your own demonstrations too, as a file; “Open a file” goes on with it"
 SPACES: Mapping[str, Space] = {"Hand": "task", "Arm": "cspace"}
 """Spaces of the avoidance, by their names on the page."""
 
@@ -57,8 +61,14 @@ class ControlPanel:
         darken: Callable[[bool], None],
         preview: Show = lambda _seen, _number: None,
         forget: Callable[[], None] = lambda: None,
+        save: Callable[[Session], None] = lambda _session: None,
+        open_scenario: Callable[[str, bytes], bool] = lambda _name, _content: False,
     ) -> None:
-        """Build the controls, for the titles of tasks and arms by name; they act once `connect` has given a session."""
+        """Build the controls, for the titles of tasks and arms by name; they act once `connect` has given a session.
+
+        `save` sends the scenario as a file and must only submit, `open_scenario` goes on with that of a file if it
+        holds one.
+        """
         self._notify, self._begin_anew, self._titles = notify, (tripod.view, forget), dict(titles)
         self._notified: Message | None = None
         self._scenes = {scene.title: scene for scene in offered(self._titles)}
@@ -66,15 +76,19 @@ class ControlPanel:
         self.presentation = Presentation(gui, self._turn, lambda alone: tripod.reframe(alone=alone))
         bindings.show(self._title, lambda title: self.presentation.write(title=title))
         enlarge = big_type(gui, tripod)
-        self._scene = self._add_choices(gui, preview)
+        self._scene = self._add_choices(
+            gui, preview, lambda name, content: open_scenario(name, content) or loader.takes(name, content)
+        )
         self.hint = gui.add_html(hint_html(""))
         add_avoid_and_imitate(gui, bindings)
         self.status = StatusLine(gui, bindings)
-        bindings.on(gui.add_button_group("History", ("Undo", "Redo", "Reset")), self._travel)
+        travels = {"Undo": Session.undo, "Redo": Session.redo, "Reset": self._reset, "Save": save}
+        buttons = gui.add_button_group("History", tuple(travels), hint=SAVE_HINT)
+        bindings.on(buttons, lambda session, button: travels[button](session))
         gui.add_html("<style>[data-dock-tab] { padding: 0 0.45em !important }</style>")  # all tabs lie in one row
         tabs = gui.add_tab_group()
         with tabs.add_tab("World"):
-            add_obstacles(gui, bindings)
+            loader = add_obstacles(gui, bindings)
             add_transforms(gui, bindings)
             add_starts(gui, bindings)
         with tabs.add_tab("Stack"):
@@ -88,7 +102,7 @@ class ControlPanel:
         with tabs.add_tab("Picture"):
             act = {"darken": darken, "enlarge": enlarge, "save_png": save_png}
             picture = PictureTab(gui, bindings, tripod, self.presentation, **act)
-        commands = self._commands(gui.main_panel, picture)
+        commands = self._commands(gui.main_panel, picture, save)
         add_commands(gui, bindings, commands)
         add_about(gui, commands)
         self.take(robot)
@@ -132,7 +146,7 @@ class ControlPanel:
             self._notify(sentence(message.text), COLOURS[message.severity][0])
         self._notified = message
 
-    def _add_choices(self, gui: viser.GuiApi, preview: Show) -> Control:
+    def _add_choices(self, gui: viser.GuiApi, preview: Show, take: Callable[[str, bytes], bool]) -> Control:
         """Add the dropdowns of tasks and scenes, and what opens recordings; return that of the scenes."""
 
         def choose(session: Session, title: str) -> None:
@@ -141,7 +155,7 @@ class ControlPanel:
         tasks = gui.add_dropdown("Task", tuple(self._titles.values()), hint="what is learned from demonstrations")
         self.bindings.properties(tasks, options=lambda _: tuple(self._titles.values()))
         self.bindings.choice(tasks, lambda s: self._titles[s.task], partial(self.begin, choose))
-        OpenPanel(gui, self.bindings, preview, self._learn, MAX_UPLOAD)
+        OpenPanel(gui, self.bindings, preview, self._learn, MAX_UPLOAD, take)
         return self.bindings.choice(
             gui.add_dropdown("Scene", (NO_SCENE, *self._scenes), hint="scenes of the paper's figures"),
             lambda s: SCENES[s.scene].title if s.scene in SCENES else NO_SCENE,
@@ -149,14 +163,30 @@ class ControlPanel:
         )
 
     def _learn(self, session: Session, task: Task) -> None:
+        self.begin(lambda session, _title: session.choose_task(self._bring(session, task)), session, task.title)
+
+    def _bring(self, session: Session, task: Task, arm: str | None = None) -> str:
+        """Take a task of the visitor's own; return its name. See `Session.bring`."""
+        own, gone = session.bring(task, arm)
+        kept = {name: title for name, title in self._titles.items() if name != gone}
+        self._titles = kept | {own.name: own.title}
+        return own.name
+
+    def resume(self, session: Session, saved: Saved, began: Callable[[Saved], None]) -> None:
+        """Go on with what was saved, beside the server's event loop; `began` gets it with its task's name on this page.
+
+        If that fails, say why and stay.
+        """
 
         def begin(session: Session, _title: str) -> None:
-            own, gone = session.bring(task)
-            kept = {name: title for name, title in self._titles.items() if name != gone}
-            self._titles = kept | {own.name: own.title}
-            session.choose_task(own.name)
+            scenario = saved.scenario
+            check_shapes(scenario)
+            if saved.own is not None:
+                scenario = replace(scenario, task=self._bring(session, saved.own.task, scenario.arm))
+            began(replace(saved, scenario=scenario))
+            session.restore(scenario)
 
-        self.begin(begin, session, task.title)
+        self.begin(begin, session, "")
 
     def _title(self, scenario: Scenario) -> str:
         return SCENES[scenario.scene].title if scenario.scene in SCENES else self._titles[scenario.task]
@@ -177,6 +207,18 @@ class ControlPanel:
         else:
             session.say(f"“{title}” is made for the JACO: choose it in Arm → Model.", Severity.WARNING)
 
+    def follow(self, session: Session, link: Link) -> None:
+        """Begin the scene or the task that a link asks for; where there is none, say so."""
+        scene = found(link.name, self._scenes.values()) if link.kind == "scene" else None
+        names = self._titles if link.kind == "task" else [each.name for each in self._scenes.values()]
+        if scene is not None:
+            self.begin(self._load, session, scene.title)
+        elif link.kind == "task" and link.name in self._titles:
+            self.begin(lambda session, _title: session.begin_task(link.name), session, self._titles[link.name])
+        else:
+            text = f"The link: {link.kind}: found {link.name!r}; accepted: {', '.join(names)}"
+            session.say(text, Severity.WARNING)
+
     def begin(self, begin: Callable[[Session, str], None], session: Session, title: str) -> None:
         """Begin a task, a scene or an arm beside the server's event loop; if that fails, show why and stay."""
 
@@ -193,7 +235,12 @@ class ControlPanel:
         session.expect(True)
         session.jobs.submit(CHOICES, work, latest=True)
 
-    def _commands(self, panel: Any, picture: PictureTab) -> list[Command]:  # noqa: ANN401 - viser's, without a name
+    def _commands(
+        self,
+        panel: Any,  # noqa: ANN401 - viser's, without a name
+        picture: PictureTab,
+        save: Callable[[Session], None],
+    ) -> list[Command]:
         folded = False  # a visitor may unfold it by hand, which nobody is told of
 
         def fold(_session: Session) -> None:
@@ -204,20 +251,20 @@ class ControlPanel:
 
         return [
             Command("Pause, or play", play_or_pause, "space"),
-            Command("Reset the scene and the camera", lambda session: self._travel(session, "Reset"), "R"),
+            Command("Reset the scene and the camera", self._reset, "R"),
             Command("Undo", Session.undo, "Z"),
             Command("Redo", Session.redo, "Z", shifted=True),
+            Command("Save the scenario as a file", save),
             *picture.commands,
             Command("Hide the panel, or show it", fold, "H"),
             *self.presentation.commands,
             *numbered(tuple(self._scenes), partial(self.begin, self._load)),
         ]
 
-    def _travel(self, session: Session, button: str) -> None:
-        {"Undo": session.undo, "Redo": session.redo, "Reset": session.reset}[button]()
-        if button == "Reset":
-            for begin in self._begin_anew:
-                begin()
+    def _reset(self, session: Session) -> None:
+        session.reset()
+        for begin in self._begin_anew:
+            begin()
 
 
 def add_avoid_and_imitate(gui: viser.GuiApi, bindings: Bindings) -> None:

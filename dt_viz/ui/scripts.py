@@ -1,4 +1,4 @@
-"""Scripts on the page, beside viser's own: one sends several files at once, one tells how wide the window is.
+"""Scripts on the page, beside viser's own: one sends several files at once, one tells what the window is and shows.
 
 An upload button of viser sends one file. So files that are chosen or dropped together are packed into one zip archive,
 without compression. Where scripts are not run, the button takes one file after another as it always does.
@@ -6,6 +6,9 @@ without compression. Where scripts are not run, the button takes one file after 
 viser's page reports the size of its canvas in the pixels that it is drawn with: device pixels, at most two for each CSS
 pixel at first, and fewer where drawing is slow. What lies beside the canvas, such as the panel, is measured in CSS
 pixels. So the page asks for an address that has the width in it, again whenever that changes.
+
+The server is not told what the address of the page says behind its `?`, as viser connects without that. So the page
+asks for an address that has it, too, and takes it out of its own: a reload goes on with what was made of it.
 """
 
 from __future__ import annotations
@@ -14,6 +17,8 @@ import html
 import re
 import secrets
 from collections.abc import Callable
+from dataclasses import dataclass
+from urllib.parse import unquote
 
 import viser
 
@@ -22,6 +27,8 @@ from dt_viz.ui import patches
 FOLDER = "window"
 NARROWEST, WIDEST = 240, 20_000
 """Widths that a window can have, CSS pixels."""
+LONGEST = 100
+"""Largest number of characters of a name in a link."""
 MEASURE = """
 clearTimeout(window.dtVizTells);
 removeEventListener('resize', window.dtVizResized);
@@ -29,8 +36,13 @@ const tell = () => fetch('ADDRESS/' + innerWidth, {cache: 'no-store'});
 window.dtVizResized = () => { clearTimeout(window.dtVizTells); window.dtVizTells = setTimeout(tell, 200); };
 addEventListener('resize', window.dtVizResized);
 tell();
+const page = new window.URL(location.href), kinds = KINDS.filter(kind => page.searchParams.has(kind));
+for (const kind of kinds.slice(0, 1))
+  fetch('ADDRESS/' + kind + '/' + encodeURIComponent(page.searchParams.get(kind)), {cache: 'no-store'});
+for (const kind of kinds) page.searchParams.delete(kind);
+if (kinds.length) history.replaceState(history.state, '', page);
 """
-"""Tells the width; ADDRESS is what is asked for."""
+"""Tells the width, and which of the KINDS of things is to be begun; ADDRESS is what is asked for."""
 DROP = """
 const input = document.getElementById('file_upload_' + BUTTON);
 if (!input || input.multiple) return;
@@ -113,12 +125,25 @@ window.dtVizForget = () => {
 """
 """Sends files; BUTTON is the button's name in the page, MOST the largest number of bytes of a file."""
 
-Measured = Callable[[str, float], None]
-"""Callback that takes the token of a ruler, and the width of its window, CSS pixels."""
+KINDS = ("scene", "task")
+"""Kinds of things that a link may name."""
+
+
+@dataclass(frozen=True)
+class Link:
+    """What the address of a page asks for, such as `/?scene=fig-4`."""
+
+    kind: str
+    """One of `KINDS`."""
+    name: str
+
+
+Told = Callable[[str, "float | Link"], None]
+"""Callback that takes the token of a ruler, and the width of its window, CSS pixels, or what the link asks for."""
 
 
 class Ruler:
-    """Measures the window of one visitor."""
+    """Measures the window of one visitor, and reads its link."""
 
     def __init__(self) -> None:
         self.token = secrets.token_urlsafe(12)
@@ -127,11 +152,14 @@ class Ruler:
     @property
     def html(self) -> str:
         """What is to stand on the page, unseen."""
-        return _run(MEASURE.replace("ADDRESS", f"{FOLDER}/{self.token}"))
+        return _run(MEASURE.replace("ADDRESS", f"{FOLDER}/{self.token}").replace("KINDS", str([*KINDS])))
 
 
-def told(path: str) -> tuple[str, float] | None:
-    """Return the token and the width, CSS pixels, that the path of a request tells; None if it is another request."""
+def told(path: str) -> tuple[str, float | Link] | None:
+    """Return the token, and the width, CSS pixels, or the link that a request's path tells; None if it tells none."""
+    asked = re.search(rf"/{FOLDER}/([\w-]+)/({'|'.join(KINDS)})/([\w.!~*'()%-]{{1,{LONGEST}}})$", path, re.ASCII)
+    if asked:
+        return asked[1], Link(asked[2], unquote(asked[3])[:LONGEST])
     found = re.search(rf"/{FOLDER}/([\w-]+)/(\d{{3,5}})$", path, re.ASCII)
     return (found[1], float(found[2])) if found and NARROWEST <= int(found[2]) <= WIDEST else None
 

@@ -24,6 +24,7 @@ from dt_viz.ui.gate import Gate, Limits
 from dt_viz.ui.keeping import KEY
 from dt_viz.ui.origins import Origin, Origins
 from dt_viz.ui.panel import MAX_UPLOAD
+from dt_viz.ui.scripts import Link
 from dt_viz.ui.tabs.status import COLOURS
 from dt_viz.ui.visitor import Visitor, notify
 from dt_viz.warning import Severity
@@ -104,7 +105,7 @@ class Server:
             max_sessions, connections, upload=MAX_UPLOAD, of_address=max_of_address or max(2, connections // 2)
         )
         self._share = share or own_share(connections)
-        self.gate = Gate(Origins(host, allowed), limits, _refuse, self._measured, self._share)
+        self.gate = Gate(Origins(host, allowed), limits, _refuse, self._told, self._share)
         self._server = self.gate.open(listening, "DT-Viz")
         self.host, self.port = host, self._server.get_port()
         self._server.gui.configure_theme(show_logo=False, show_share_button=False)
@@ -221,10 +222,10 @@ class Server:
                 return
         visitor.close()  # left while the page was being built
 
-    def _measured(self, token: str, width: float) -> None:
+    def _told(self, token: str, what: float | Link) -> None:
         for visitor in self.visitors:
             if visitor.ruler.token == token:
-                visitor.measured(width)
+                visitor.told(what)
 
     def _farewell(self, client: viser.ClientHandle) -> None:
         with self._lock:

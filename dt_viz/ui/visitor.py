@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -13,12 +13,16 @@ import numpy as np
 import viser
 
 from dt_viz.accounts import Account
+from dt_viz.errors import DataError
 from dt_viz.files.uploads import keep_ready, let_go
 from dt_viz.obstacles.shapes import Sphere, TriangleObstacle, as_point
 from dt_viz.robot.robot import Robot
-from dt_viz.scenario.saved import Known, Saved
+from dt_viz.scenario.own import Own
+from dt_viz.scenario.relocation import in_world
+from dt_viz.scenario.saved import Known, Saved, encode, is_saved
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import with_avoidance
+from dt_viz.scenario.tasks import TASKS
 from dt_viz.serving.board import Share
 from dt_viz.session.arms import ArmStore
 from dt_viz.session.comparison import OTHERS
@@ -27,6 +31,7 @@ from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.opening import Preview
 from dt_viz.session.progress import Display, Pace, Progress
 from dt_viz.session.session import Session
+from dt_viz.ui.bindings import EDITS
 from dt_viz.ui.counting import Counted
 from dt_viz.ui.keeping import Keeper
 from dt_viz.ui.panel import ControlPanel
@@ -36,19 +41,23 @@ from dt_viz.ui.scene.export import RESOLUTIONS, render_png
 from dt_viz.ui.scene.palette import DARK, LIGHT, Colour, Theme
 from dt_viz.ui.scene.robot_scene import RobotScene
 from dt_viz.ui.scene.scene import ScenePictures
-from dt_viz.ui.scripts import Ruler
+from dt_viz.ui.scripts import Link, Ruler
+from dt_viz.warning import Severity
 
 
 def initial_scenario(engine: Engine, name: str) -> Scenario:
     """Return the scenario that a task begins with. Raises what `Engine.task` raises."""
     scenario, task = Scenario(name), engine.task(name)
+    if task.layers:
+        return replace(scenario, stack=in_world(task))
     sphere = Sphere(task.obstacle_position, task.size * Sphere.diameter)
     return replace(scenario, stack=with_avoidance(scenario, obstacles=(sphere,)))
 
 
-def _takes_long(scenario: Scenario) -> bool:
-    """Whether another arm, or surfaces of obstacles, are to be made for a scenario before it is shown."""
-    return bool(scenario.arm) or any(isinstance(obstacle, TriangleObstacle) for obstacle in scenario.obstacles)
+def _takes_long(saved: Saved) -> bool:
+    """Whether another arm, surfaces of obstacles, or a task are to be made for a scenario before it is shown."""
+    shapes = any(isinstance(obstacle, TriangleObstacle) for obstacle in saved.scenario.obstacles)
+    return bool(saved.scenario.arm) or saved.own is not None or shapes
 
 
 def notify(client: viser.ClientHandle, text: str, colour: Colour) -> None:
@@ -100,15 +109,15 @@ class Visitor(Display):
             self._darken,
             self._preview,
             self._keeper.forget,
+            self._save,
+            self._open,
         )
         begun = self._keeper.begun
-        at_once = None if begun is None or _takes_long(begun.scenario) else begun.scenario
+        at_once = None if begun is None or _takes_long(begun) else begun.scenario
         display = self if share is None else Counted(self, share)
         self.session = Session(engine, initial_scenario, task, display, arms and arms.engine, at_once, account)
         self._panel.connect(self.session)
         self._keeper.begin(self.session, self._resume)
-        if begun is not None and at_once is None:
-            self._resume(begun)
         self.ruler = Ruler()
         """What the visitor's window is measured with."""
         self.robot.playback.begin(self.session.jobs, self.session.fail)
@@ -118,9 +127,12 @@ class Visitor(Display):
         """Have the browser measure its window from now on."""
         self.client.gui.add_html(self.ruler.html)
 
-    def measured(self, width: float) -> None:
-        """Take the width of the window, CSS pixels."""
-        self._camera.measured(width)
+    def told(self, what: float | Link) -> None:
+        """Take the width of the window, CSS pixels, or begin what the link of the page asks for."""
+        if isinstance(what, Link):
+            self._panel.follow(self.session, what)
+        else:
+            self._camera.measured(what)
 
     def draw(self, frame: Frame, pace: Pace) -> None:
         beside = tuple(panel.shown for panel in frame.pictures.panels)
@@ -156,14 +168,35 @@ class Visitor(Display):
         let_go(self)
         self.session.close()
 
-    def _made(self) -> Saved:
-        """What the visitor has made."""
-        pose = self._camera.chosen
-        return Saved(self.session.scenario, None if pose is None else (as_point(pose[0]), as_point(pose[1])))
+    def _made(self, tasks: Collection[str]) -> Saved:
+        """What the visitor has made, with the task unless it is one of these."""
+        pose, scenario = self._camera.chosen, self.session.scenario
+        own = None if scenario.task in tasks else Own.of(self.session.engines(scenario.arm).task(scenario.task))
+        return Saved(scenario, None if pose is None else (as_point(pose[0]), as_point(pose[1])), own)
 
     def _resume(self, saved: Saved) -> None:
-        """Go on with what was kept, beside the server's event loop."""
-        self._panel.begin(lambda session, _title: session.restore(saved.scenario), self.session, "")
+        """Go on with what was saved, beside the server's event loop."""
+        self._panel.resume(self.session, saved, self._keeper.go_on)
+
+    def _save(self, session: Session) -> None:
+        """Send the scenario as a file, beside the server's event loop, or say why that cannot be."""
+
+        def send() -> None:
+            try:
+                content = encode(self._made(TASKS)).encode()
+            except DataError as error:
+                session.say(str(error), Severity.ALARM)
+            else:
+                self.client.send_file_download(f"{self._name}.json", content, save_immediately=True)
+
+        session.jobs.submit(EDITS, send)
+
+    def _open(self, name: str, content: bytes) -> bool:
+        """Go on with the scenario that a file holds; return whether it holds one. Raises as `decode`."""
+        if not is_saved(content):
+            return False
+        self._resume(self._keeper.read(content, name))
+        return True
 
     def _preview(self, seen: Preview | None, number: int | None) -> None:
         """Show takes that are not learned yet in place of the motion; see `ui.tabs.opening.Show`."""
@@ -230,6 +263,10 @@ class Visitor(Display):
     def _save_png(self, resolution: str, transparent: bool) -> None:
         with self.pictures.without_handles(), self.robot.grip.hidden(), self._light():
             content = render_png(self.client, RESOLUTIONS[resolution], self._panel.legend, transparent=transparent)
+        self.client.send_file_download(f"{self._name}.png", content, save_immediately=True)
+
+    @property
+    def _name(self) -> str:
+        """Name of files that are saved, without their suffix."""
         scenario = self.session.scenario
-        name = f"dt-viz-{'-'.join(filter(None, (scenario.task, scenario.arm)))}.png"
-        self.client.send_file_download(name, content, save_immediately=True)
+        return "-".join(filter(None, ("dt-viz", scenario.task, scenario.arm)))

@@ -132,14 +132,13 @@ class Other:
         """Open demonstrations of his own and learn them, again and again."""
         client, rng, demonstrations = self.client, np.random.default_rng(0), TASKS[OTHER.learned]().demonstrations
         while True:
-            await client.set("Open your demonstrations", True)
             takes = BytesIO()
             with ZipFile(takes, "w") as archive:
                 for number, own in enumerate(demonstrations):
                     noisy = own.positions + OTHER.noise * rng.normal(size=own.positions.shape)
                     rows = [",".join(f"{value:.5f}" for value in row) for row in np.column_stack([own.times, noisy])]
                     archive.writestr(f"{number}.csv", "\n".join(["t,x,y,z", *rows]))
-            await client.send_file("Choose files, or drop them here", "takes.zip", takes.getvalue())
+            await client.send_file("Open a file, or drop it here", "takes.zip", takes.getvalue())
             learn = client.controls[client.find("Learn")]
             await client.wait_for(lambda learn=learn: not learn["disabled"], SETTINGS.patience)
             task = client.controls[client.find("Task")]

@@ -9,9 +9,11 @@ import sys
 from contextlib import contextmanager
 from pathlib import Path
 
+import browsing
 import pytest
 from browsing import (
     PATIENCE,
+    STORED,
     UNHURRIED,
     close_notices,
     open_page,
@@ -31,12 +33,11 @@ from dt_viz.ui import keeping
 pytestmark = [pytest.mark.browser, needs_chromium]
 
 APP = Path(dt_viz.__file__).parent.parent / "app.py"
-STORED = "Object.keys(localStorage).find(key => key.endsWith('dt-viz'))"
 
 
 def kept(page):
-    """What the browser keeps; None if it keeps nothing."""
-    text = page.evaluate(f"localStorage.getItem({STORED})")
+    """The scenario that the browser keeps; None if it keeps nothing."""
+    text = browsing.kept(page)
     return None if text is None else decode(text, Known(tuple(TASKS))).scenario
 
 

@@ -1,26 +1,10 @@
 """A visitor's own recordings in a real browser: several files are chosen at once, or dropped, seen, and learned."""
 
-import numpy as np
 import pytest
-from browsing import PATIENCE, close_notices, close_page, open_page, press, wait_until
+from browsing import DROP, PATIENCE, close_notices, close_page, open_page, press, take, wait_until
 from chromium import needs_chromium
 
 pytestmark = [pytest.mark.browser, needs_chromium]
-RNG = np.random.default_rng(5)
-DROP = """files => {
-    const transfer = new DataTransfer();
-    for (const [name, text] of files) transfer.items.add(new File([text], name));
-    for (const type of ['dragover', 'drop'])
-        document.body.dispatchEvent(new DragEvent(type, {dataTransfer: transfer, bubbles: true, cancelable: true}));
-}"""
-
-
-def take(goal=(0.2, -0.45, 0.3)):
-    u = np.linspace(0, 1, 150)
-    start = np.array([-0.2, -0.4, 0.2]) + RNG.normal(scale=0.01, size=3)
-    path = start + (3 * u**2 - 2 * u**3)[:, None] * (np.array(goal) - start) + RNG.normal(scale=0.001, size=(150, 3))
-    rows = np.column_stack([3 * u, path])
-    return "\n".join(["timestamp,pos_x,pos_y,pos_z", *(",".join(f"{v:.5f}" for v in row) for row in rows)]).encode()
 
 
 @pytest.fixture(name="tab")
@@ -32,8 +16,6 @@ def _tab(browser, server):
 
 def test_six_files_chosen_at_once_are_seen_and_learned_by_a_click_and_undo_goes_back(tab):
     page, visitor = tab
-    press(page.get_by_role("button", name="Open your demonstrations"))
-    page.get_by_role("button", name="Choose files, or drop them here").wait_for()
     files = [{"name": f"pour_{k}.csv", "mimeType": "text/csv", "buffer": take()} for k in range(5)]
     files.append({"name": "astray.csv", "mimeType": "text/csv", "buffer": take((-0.1, -0.5, 0.5))})
     wait_until(lambda: page.locator("input[type=file]").first.evaluate("input => input.multiple"), "the script")
@@ -56,7 +38,6 @@ def test_six_files_chosen_at_once_are_seen_and_learned_by_a_click_and_undo_goes_
 
 def test_files_dropped_on_the_page_are_seen_and_cancel_goes_back(tab):
     page, visitor = tab
-    press(page.get_by_role("button", name="Open your demonstrations"))
     wait_until(lambda: page.locator("input[type=file]").first.evaluate("input => input.multiple"), "the script")
     page.evaluate(DROP, [[f"drop_{k}.csv", take().decode()] for k in range(2)])
     page.get_by_text("drop_1").first.wait_for()

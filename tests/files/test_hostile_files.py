@@ -1,5 +1,6 @@
 """Hostile files: whatever the bytes, all loaders end soon, in bounded memory, with what they hold or a clear error."""
 
+import base64
 import io
 import json
 import os
@@ -16,7 +17,9 @@ import hostile
 import numpy as np
 import pytest
 import trimesh
-from hostile import PROCESS, hostile_file, seeds
+from hostile import PROCESS, hostile_file, hostile_scenario, saved_scenario, seeds
+
+from dt_viz.scenario.saved import MAX_BYTES
 
 pytestmark = pytest.mark.skipif(not PROCESS.exists(), reason="memory is measured in Linux's way")
 
@@ -237,3 +240,71 @@ def test_mutated_files_are_read_or_refused():
 @pytest.mark.slow
 def test_very_many_mutated_files_are_read_or_refused():
     read_all(range(3000), MAX_GROWTH_FINE)
+
+
+# --- saved scenarios ---
+
+MAX_SCENARIO_GROWTH, MAX_SCENARIO_SECONDS = 200, 1.0
+"""Memory, MB, and processor time in which a scenario is read or refused."""
+GOOD = saved_scenario().decode()
+FULL = MAX_BYTES - 1000
+
+
+def with_points(points: np.ndarray) -> str:
+    """The good scenario, its cloud with other points."""
+    plain = json.loads(GOOD)
+    (name,) = (name for name in plain["arrays"] if name.endswith("cloud.points"))
+    plain["arrays"][name] |= {"shape": points.shape, "data": base64.b64encode(points.tobytes()).decode()}
+    plain["arrays"].pop(name.replace("points", "labels"))
+    return json.dumps(plain).replace(f'"{name.replace("points", "labels")}"', "null")
+
+
+BOMBS = {
+    "deep": "[" * FULL,
+    "deep in a field": '{"version":2,"class":"Saved","scenario":' + "[" * FULL,
+    "wide": '{"version":2,"class":"Saved","scenario":[' + "{}," * (FULL // 3) + "0]}",
+    "many fields": "{" + ",".join(f'"{k}":0' for k in range(FULL // 14)) + "}",
+    "many of one field": '{"version":2' + ',"camera":0' * (FULL // 11) + "}",
+    "many arrays": GOOD[:-2]
+    + ",".join(["", *(f'"{k:06}":{{"shape":[0],"type":"float64","data":""}}' for k in range(FULL // 60))])
+    + "}}",
+    "many axes": GOOD.replace('"shape":[20,3]', f'"shape":[{"9," * (FULL // 4)}1]', 1),
+    "huge shape": GOOD.replace('"shape":[20,3]', '"shape":[1000000000000,3]', 1),
+    "negative shape": GOOD.replace('"shape":[20,3]', '"shape":[-1,3]', 1),
+    "huge integer": GOOD.replace('"arm_rollout":0', f'"arm_rollout":{"9" * 250_000}', 1),
+    "huge number": GOOD.replace('"warp":1.0', '"warp":1e308', 1),
+    "many digits": GOOD.replace('"warp":1.0', f'"warp":7.{"1" * 250_000}', 1),
+    "long text": GOOD.replace("arc 0", "a" * 250_000, 1),
+    "long text, escaped": GOOD.replace("arc 0", "\\u0061" * 40_000, 1),
+    "many findings": GOOD.replace('"moves":[', '"seen":[' + '"",' * 95_000 + '""],"moves":[', 1),
+    "twice": GOOD.replace('"version":2', '"version":2,"version":1,"version":3', 1),
+    "many points": with_points(np.random.default_rng(0).uniform(-0.1, 0.1, (400_000, 3))),
+    "many triangles": GOOD.replace("AAAA", "AAAAAAAA" * (FULL // 8), 1),
+    "too large": GOOD + " " * MAX_BYTES,
+}
+
+
+@pytest.mark.parametrize("text", BOMBS.values(), ids=BOMBS)
+def test_a_bomb_for_a_scenario_is_refused_at_once_in_little_memory(text, scenarios):
+    assert len(text) <= 3 * MAX_BYTES
+    outcome = scenarios.read("scenario", "a.json", text.encode())
+    check(outcome, "a.json")
+    assert outcome.message and outcome.growth < MAX_SCENARIO_GROWTH and outcome.seconds < MAX_SCENARIO_SECONDS
+
+
+def test_five_hundred_damaged_scenarios_are_refused_by_a_field_or_read_exactly(scenarios):
+    outcomes = [scenarios.read("scenario", "a.json", hostile_scenario(number)) for number in range(500)]
+    for outcome in outcomes:
+        check(outcome, "a.json")
+        assert outcome.growth < MAX_SCENARIO_GROWTH and outcome.seconds < MAX_SCENARIO_SECONDS, outcome
+    num_read = sum(not outcome.message for outcome in outcomes)
+    slowest, largest = max(o.seconds for o in outcomes), max(o.growth for o in outcomes)
+    print(f"{num_read} of 500 were read; at most {slowest:.2f} s, {largest:.0f} MB")
+    assert 10 < num_read < 400
+
+
+@pytest.fixture(name="scenarios", scope="module")
+def _scenarios():
+    with reading("--coarse") as process:
+        assert not process.read("scenario", "a.json", GOOD.encode()).message
+        yield process

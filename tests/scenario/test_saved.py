@@ -3,7 +3,9 @@
 import copy
 import json
 import math
+from contextlib import nullcontext
 from dataclasses import fields, replace
+from pathlib import Path
 from typing import Any
 
 import hostile
@@ -17,17 +19,32 @@ from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.avoidance.passing import ANEW
 from dt_viz.errors import DataError
 from dt_viz.flows.diffeomorphisms import Integration
+from dt_viz.learning.demonstrations import Demonstration, check_demonstrations
+from dt_viz.learning.inspection import PreparationSettings
 from dt_viz.obstacles.clouds import Cloud
 from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, MeshObstacle, Sphere
 from dt_viz.obstacles.solids import Solid
 from dt_viz.obstacles.surfaces import box_surface
+from dt_viz.scenario import saved as saved_module
+from dt_viz.scenario.own import Own
 from dt_viz.scenario.panels import Panel
 from dt_viz.scenario.paper_scenes import CLOVER, SCENES, bottle, offered
-from dt_viz.scenario.saved import MAX_BYTES, SHIPPED, Known, Saved, ScenarioError, decode, encode, portable
+from dt_viz.scenario.saved import (
+    MAX_BYTES,
+    SHIPPED,
+    Known,
+    Saved,
+    ScenarioError,
+    check_shapes,
+    decode,
+    encode,
+    is_saved,
+    portable,
+)
 from dt_viz.scenario.scenario import SLICE_COLOURS, Scenario, Start, View
 from dt_viz.scenario.slices import SlicePose
 from dt_viz.scenario.stack import with_avoidance
-from dt_viz.scenario.tasks import TASKS
+from dt_viz.scenario.tasks import OWN, TASKS
 
 METHODS = ("eflow-repulsive", "linear", "modulation")
 KNOWN = Known(tuple(TASKS), ("", "panda"), METHODS)
@@ -171,6 +188,88 @@ def test_shapes_from_files_are_left_out_and_counted():
     assert portable(left) == (left, 0)
 
 
+# --- what does not ship ---
+
+
+def brought(dim: int = 3) -> Own:
+    """Demonstrations that a visitor has brought, with values that are no short decimals."""
+    rng, s = np.random.default_rng(5), np.linspace(0, 1, 40)[:, None]
+    turns = rng.normal(size=(40, 4))
+    paths = [s * rng.normal(size=dim) * 0.2 + 0.05 * s * (1 - s) * rng.normal(size=dim) for _ in range(3)]
+    given = [Demonstration(3 * s[:, 0] + s[:, 0] / 3, path, f"Größe <{k}>", turns) for k, path in enumerate(paths)]
+    settings = PreparationSettings(goal=tuple(paths[0][-1].tolist()), cut_pauses=False)
+    moves = (0.7, (0.1, -0.4, 1 / 3)), (1.3, (0.0, 0.0, 0.1))
+    return Own(check_demonstrations(given, "test"), settings, ("‘0’ stands still",), moves)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_demonstrations_and_shapes_from_files_are_read_back_to_the_last_bit(dim):
+    own, cloud = brought(dim), Cloud(np.random.default_rng(0).uniform(-0.1, 0.1, (60, 3)))
+    obstacles = MeshObstacle(PLACE, FROM_FILE, TURN, 0.7), CloudObstacle(PLACE, cloud), MeshObstacle(PLACE, bottle())
+    saved = Saved(changed(Scenario("own_data_3"), obstacles=obstacles), own=own)
+    text = encode(saved)
+    again = decode(text, KNOWN)
+    assert encode(again) == text == encode(decode(text.encode(), KNOWN))
+    assert again.scenario == replace(saved.scenario, task=OWN) and again.own is not None
+    before, after = own.task, again.own.task
+    for a, b in zip(before.demonstrations, after.demonstrations, strict=True):
+        assert (a.name, a.times.tobytes(), a.positions.tobytes()) == (b.name, b.times.tobytes(), b.positions.tobytes())
+        assert a.orientations is not None and b.orientations is not None
+        assert a.orientations.tobytes() == b.orientations.tobytes()
+    assert [path.tobytes() for path in before.paths] == [path.tobytes() for path in after.paths]
+    assert (after.preparation, after.seen, after.size) == (own.preparation, own.seen, before.size)
+    assert (after.camera, after.obstacle_position) == (before.camera, before.obstacle_position)
+    assert is_saved(text.encode())
+
+
+def test_a_text_of_the_first_version_is_read_and_saved_as_one_of_this():
+    first = (Path(__file__).parent.parent / "frozen" / "scenario_version_1.json").read_text(encoding="utf-8")
+    assert '"version":1' in first and is_saved(first.encode())
+    saved = decode(first, KNOWN)
+    assert saved == rich()
+    assert '"version":2' in encode(saved)
+    assert_read_back(saved)
+
+
+def test_an_open_mesh_is_refused_and_a_closed_one_is_not():
+    for faces, refused in ((FROM_FILE.faces, False), (FROM_FILE.faces[:5], True)):
+        mesh = MeshObstacle(PLACE, Solid(FROM_FILE.vertices, faces))
+        saved = decode(encode(Saved(changed(Scenario("draw_s"), obstacles=(mesh,)))), KNOWN)
+        with pytest.raises(ScenarioError, match="mesh") if refused else nullcontext():
+            check_shapes(saved.scenario)
+
+
+def test_what_is_larger_than_can_be_read_is_not_saved(monkeypatch):
+    monkeypatch.setattr(saved_module, "MAX_BYTES", 2000)
+    with pytest.raises(ScenarioError, match="file"):
+        encode(Saved(Scenario("own_data_1"), own=brought()))
+
+
+OWN_FORGERIES: list[tuple[str, Any, str]] = [
+    ("scenario.task", "draw_s", "task"),
+    ("own.demonstrations", [], "arrays"),
+    ("own.demonstrations.0.times", "saved.own.demonstrations[1].times", "times"),
+    ("own.demonstrations.0.orientations", None, "arrays"),
+    ("own.preparation.cutoff", 1e-9, "preparation"),
+    ("own.preparation.goal", [0.0], "goal"),
+    ("own.preparation.goal", [0.0, 1e9, 0.0], "goal"),
+    ("own.seen", ["x"] * 1001, "seen"),
+    ("own.moves", [[1.0, [0, 0, 0]]] * 21, "moves"),
+    ("own.moves", [[0.0, [0, 0, 0]]], "scale"),
+    ("own.moves", [[1.0, [0, 0, 9]]], "shift"),
+    ("own.moves", [[10.0, [0, 0, 0]]] * 9, "farthest"),
+    ("arrays", {}, "times"),
+]
+
+
+@pytest.mark.parametrize(("path", "value", "field"), OWN_FORGERIES, ids=str)
+def test_forged_demonstrations_are_refused_by_the_name_of_what_is_wrong(path, value, field):
+    forged = at(path, json.loads(encode(Saved(Scenario("own_data_1"), own=brought()))), value)
+    with pytest.raises(DataError) as caught:
+        decode(json.dumps(forged), KNOWN, "a file")
+    assert field in caught.value.field and str(caught.value).startswith("a file: "), caught.value
+
+
 # --- what no page has saved ---
 
 
@@ -191,10 +290,12 @@ AVOIDANCE, BIAS, SPHERE = (
     "scenario.stack.2.transform.obstacles.0",
 )
 FORGERIES: list[tuple[str, Any, str]] = [
-    ("version", 2, "version"),
+    ("version", 3, "version"),
+    ("version", 0, "version"),
+    ("version", True, "version"),
     ("version", None, "version"),
     ("scenario", None, "saved.scenario"),
-    ("extra", 1, "fields of saved"),
+    ("extra", 1, "fields"),
     ("scenario.extra", 1, "fields of saved.scenario"),
     ("scenario.task", "own_data_1", "task"),
     ("scenario.task", 3, "saved.scenario.task"),
@@ -237,7 +338,8 @@ FORGERIES: list[tuple[str, Any, str]] = [
     (f"{AVOIDANCE}.generator", "∇p", "generator"),
     (f"{AVOIDANCE}.detour.num_directions", 10_000, "detour"),
     (f"{AVOIDANCE}.obstacles", [{"class": "Sphere", "position": PLACE}] * 6, "obstacles"),
-    (f"{AVOIDANCE}.obstacles.0", {"class": "MeshObstacle", "position": PLACE, "mesh": "a"}, "class"),
+    (f"{AVOIDANCE}.obstacles.0", {"class": "MeshObstacle", "position": PLACE, "mesh": "a"}, "mesh"),
+    ("arrays", {"a": {"shape": [1], "type": "float64", "data": "AAAAAAAAAAA="}}, "arrays"),
     (f"{AVOIDANCE}.obstacles.1.sizes", [0.1, 0.1, 1e-4], "depth"),
     (f"{AVOIDANCE}.obstacles.1.sizes", [0.1, 0.1, 5.0], "radius"),
     (f"{AVOIDANCE}.obstacles.1.wxyz", [0, 0, 0, 0], "wxyz"),

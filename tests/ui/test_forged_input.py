@@ -22,7 +22,6 @@ from dt_viz.session.session import CHOICES
 from dt_viz.ui import controls, gestures
 from dt_viz.ui.scene import markers
 from dt_viz.ui.scene.camera import view_of
-from dt_viz.ui.tabs import opening
 
 SCENES = offered(TASKS)
 BORDERS = {controls.__name__, gestures.__name__, markers.__name__}
@@ -40,9 +39,8 @@ TURNS = [(0.0,) * 4, (math.nan, 0.0, 0.0, 0.0), (1e300, 0.0, 0.0, 0.0), (1.0, 0.
 
 
 @pytest.fixture(autouse=True)
-def _at_rest(page, monkeypatch):
-    """No presentation, and a camera that stays where it is put: something forged may have begun others. No reader."""
-    monkeypatch.setattr(opening, "make_ready", lambda: None)
+def _at_rest(page):
+    """No presentation, and a camera that stays where it is put: something forged may have begun others."""
     page.visitor._panel.presentation.show(False)
     for switch in page.inputs:
         if switch.label in ("Orbit", "Lock camera") and switch.value:

@@ -1,5 +1,6 @@
 """What a visitor has made is kept in his browser: the newest, not too often, and whatever that keeps the page opens."""
 
+import threading
 import time
 from dataclasses import replace
 from typing import Any
@@ -14,15 +15,17 @@ from dt_viz.obstacles.shapes import Box, MeshObstacle, Sphere
 from dt_viz.obstacles.solids import Solid
 from dt_viz.obstacles.surfaces import box_surface
 from dt_viz.scenario.paper_scenes import SCENES
-from dt_viz.scenario.saved import Known, Saved, decode, encode
+from dt_viz.scenario.saved import MAX_BYTES, Known, Saved, decode, encode
 from dt_viz.scenario.scenario import Scenario
-from dt_viz.scenario.tasks import TASKS
+from dt_viz.scenario.tasks import TASKS, own_task
 from dt_viz.session.frame import Stage
 from dt_viz.session.session import CHOICES
-from dt_viz.ui import keeping
+from dt_viz.ui import keeping, panel
 from dt_viz.ui.keeping import KEY, LANE, PAUSE
 from dt_viz.ui.scene.camera import view_of
+from dt_viz.ui.scripts import Link
 from dt_viz.ui.tabs.status import verdict
+from dt_viz.ui.visitor import initial_scenario
 
 PLACE = (0.1, -0.5, 0.4)
 KNOWN = Known(tuple(TITLES))
@@ -205,8 +208,8 @@ def test_a_reset_is_told_after_what_was_edited_before(opened):
 FORGED = {
     "damaged": made()[: len(made()) // 2],
     "forged": made().replace('"warp":1.0', '"warp":7.0'),
-    "another version": made().replace('"version":1', '"version":99'),
-    "too large": made() + " " * 100_000,
+    "another version": made().replace('"version":2', '"version":99'),
+    "too large": made() + " " * MAX_BYTES,
     "of a task that is not here": made().replace("draw_c", "own_data_1"),
     "something else": '{"theme": "dark"}',
 }
@@ -245,15 +248,86 @@ def test_a_browser_without_room_is_noticed_and_that_is_said_once(opened):
     assert said == [keeping.FULL] and len(browser.told) == 2
 
 
+def look_from_the_top(page: Page) -> None:
+    """Move the camera, as its first report may do, too."""
+    page.visitor._camera.look(TASKS["draw_s"]())
+    page.visitor._camera.view("Top")
+
+
 def test_the_page_opens_before_a_slow_browser_has_told_and_goes_on_with_it_when_it_does(opened):
     browser = Slow(**{KEY: made()})
     page = opened(browser)
     assert page.session.scenario.task == "draw_s" and message(page) == keeping.SLOW
+    look_from_the_top(page)
+    assert browser.told == []
     browser.answers = True
     wait_until(lambda: page.session.scenario == MADE)
     settled(page)
     assert page.session.jobs.wait_idle(CHOICES, PATIENCE)
     assert page.session._screen.progress.restored == MADE
+    assert {decode(text, KNOWN).scenario for _, text in browser.told} <= {MADE}
+
+
+def test_what_a_browser_keeps_is_not_overwritten_before_the_page_goes_on_with_it(opened, monkeypatch):
+    ready, scene = threading.Event(), SCENES["lift"].scenario(TASKS["lift_box"]())
+    monkeypatch.setattr(panel, "check_shapes", lambda _scenario: ready.wait(PATIENCE))
+    browser = Browser(**{KEY: made(scenario=scene)})
+    page = opened(browser)
+    look_from_the_top(page)
+    settled(page)
+    assert page.session.scenario.task == "draw_s" and browser.told == []
+    ready.set()
+    wait_until(lambda: page.session.scenario == scene)
+    look_from_the_top(page)
+    settled(page)
+    assert kept(browser).scenario == scene and kept(browser).camera is not None
+
+
+def test_a_slow_browser_that_keeps_nothing_is_told_where_the_camera_is_once_it_has_answered(opened):
+    browser = Slow()
+    page = opened(browser)
+    browser.answers = True
+    settled(page)
+    look_from_the_top(page)
+    settled(page)
+    assert kept(browser).camera is not None
+
+
+def test_a_browser_that_never_tells_is_given_up_and_told_of_edits_only(opened, monkeypatch):
+    monkeypatch.setattr(keeping, "PATIENCE", 0.01)
+    browser = Slow(**{KEY: made()})
+    page = opened(browser)
+    settled(page)
+    assert browser.asked == 1 + keeping.ATTEMPTS
+    look_from_the_top(page)
+    settled(page)
+    assert browser.told == []
+    page.session.edit("Warp", warp=0.5)
+    settled(page)
+    assert kept(browser).scenario.warp == 0.5
+
+
+def test_what_a_slow_browser_tells_while_a_task_is_chosen_or_after_a_reset_is_not_taken(opened):
+    browser, chosen = Slow(**{KEY: made()}), threading.Event()
+    page = opened(browser)
+
+    def choose(session: Any, _title: str) -> None:
+        assert chosen.wait(PATIENCE)
+        session.choose_task("draw_j")
+
+    page.visitor._panel.begin(choose, page.session, "")
+    browser.answers = True
+    wait_until(lambda: not page.visitor._keeper._attempts)
+    chosen.set()
+    settled(page)
+    assert page.session.scenario.task == "draw_j" and kept(browser).scenario.task == "draw_j"
+    browser = Slow(**{KEY: made()})
+    page = opened(browser)
+    page.claim(page["History"], "Reset")
+    browser.answers = True
+    settled(page)
+    assert page.session.jobs.wait_idle(CHOICES, PATIENCE)
+    assert page.session.scenario.task == "draw_s" and KEY not in browser
 
 
 def test_what_a_slow_browser_tells_after_an_edit_is_not_taken(opened):
@@ -278,9 +352,29 @@ def test_two_pages_of_one_browser_keep_the_last_edit_and_complain_of_nothing(ope
     other.close()
 
 
-def test_what_is_not_kept_is_said_once_and_all_else_is_kept(opened):
+def test_shapes_from_files_are_kept_and_come_back_beside_the_event_loop(opened):
+    browser, box = Browser(), MeshObstacle(PLACE, Solid(*box_surface(np.full(3, 0.05))))
+    page = opened(browser)
+    page.begin(changed(MADE, obstacles=(box, Sphere(PLACE))))
+    settled(page)
+    assert message(page) == "" and kept(browser).scenario.obstacles == (box, Sphere(PLACE))
+    again = opened(Browser(**browser))
+    assert again.session.jobs.wait_idle(CHOICES, PATIENCE)
+    assert again.session.scenario == page.session.scenario
+
+
+def test_a_broken_shape_that_is_kept_is_said_and_the_page_begins_anew(opened):
+    vertices, faces = box_surface(np.full(3, 0.05))
+    text = made(scenario=changed(MADE, obstacles=(MeshObstacle(PLACE, Solid(vertices, faces[:4])),)))
+    page = opened(Browser(**{KEY: text}))
+    assert page.session.jobs.wait_idle(CHOICES, PATIENCE)
+    assert "mesh: found" in message(page) and page.session.scenario.task == "draw_s"
+
+
+def test_what_is_not_kept_is_said_once_and_all_else_is_kept(opened, monkeypatch):
     browser = Browser()
     page = opened(browser)
+    monkeypatch.setattr(keeping, "MAX_KEPT", len(made()) + 200)
     said = []
     page.session.say = lambda text, severity: said.append(text)
     ball, box = Sphere(PLACE), MeshObstacle(PLACE, Solid(*box_surface(np.full(3, 0.05))))
@@ -292,7 +386,31 @@ def test_what_is_not_kept_is_said_once_and_all_else_is_kept(opened):
     assert kept(browser).scenario == replace(changed(MADE, obstacles=(ball,)), warp=0.5)
 
 
-def test_a_task_of_own_demonstrations_leaves_what_was_kept_before(opened):
+def own_page(opened: Any, browser: Browser) -> Page:
+    """A page on which a task of the visitor's own is shown."""
+    page = opened(browser)
+    own, _ = page.session.bring(own_task(TASKS["draw_s"]().demonstrations).placed(0.8, (0.1, 0.0, 1 / 3)))
+    page.visitor._panel._titles[own.name] = own.title
+    page.session.choose_task(own.name)
+    settled(page)
+    return page
+
+
+def test_a_task_of_own_demonstrations_is_kept_with_them_and_comes_back(opened):
+    browser = Browser()
+    page = own_page(opened, browser)
+    again = opened(Browser(**browser))
+    assert again.session.jobs.wait_idle(CHOICES, PATIENCE)
+    settled(again)
+    before, after = page.session.task, again.session.task
+    assert after is not before and again["Task"].value == "Your data" and message(again) == ""
+    assert [np.array_equal(a, b) for a, b in zip(before.paths, after.paths, strict=True)] == [True] * len(after.paths)
+    assert again.session.scenario == page.session.scenario
+    assert kept(again.client.local_storage).own is not None
+
+
+def test_a_task_of_large_demonstrations_leaves_what_was_kept_before(opened, monkeypatch):
+    monkeypatch.setattr(keeping, "MAX_KEPT", 5000)
     browser = Browser(**{KEY: made()})
     page = opened(browser)
     own, _ = page.session.bring(replace(TASKS["draw_s"](), name=""))
@@ -310,6 +428,17 @@ def test_scenes_with_a_bottle_come_back_beside_the_event_loop(opened):
     page = opened(Browser(**{KEY: made(scenario=scene)}))
     assert page.session.jobs.wait_idle(CHOICES, PATIENCE)
     assert page.session.scenario == scene and page.session._screen.progress.restored == scene
+
+
+def test_a_link_begins_its_task_afresh_also_where_that_is_what_was_kept_and_undo_brings_it_back(opened):
+    page = opened(Browser(**{KEY: made()}))
+    page.visitor.told(Link("task", MADE.task))
+    assert page.session.jobs.wait_idle(CHOICES, PATIENCE)
+    assert page.session.scenario == initial_scenario(page.session.engine, MADE.task)
+    settled(page)
+    assert kept(page.client.local_storage).scenario == page.session.scenario
+    page.session.undo()
+    assert page.session.scenario.choices == MADE.choices
 
 
 # --- the camera ---

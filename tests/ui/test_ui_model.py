@@ -118,9 +118,8 @@ def test_takes_that_are_open_are_read_again_for_another_arm(page):
     rows = np.column_stack([3 * u, robot.home + np.outer(u - 1, np.linspace(0.3, 0.1, 6)), np.full(100, 0.5)])
     header = ",".join(["t", *(f"joint{k}" for k in range(1, 8))])  # six and a gripper, or seven
     content = "\n".join([header, *(",".join(map(str, row)) for row in rows)]).encode()
-    page.claim(page["Open your demonstrations"], True)
     done()
-    page.claim(page["Choose files, or drop them here"], viser.UploadedFile("a.csv", content))
+    page.claim(page["Open a file, or drop it here"], viser.UploadedFile("a.csv", content))
     done()
     takes = page.visitor.pictures._takes
     np.testing.assert_allclose(takes.goal.position, robot.end_effector(rows[-1:, 1:7])[0], atol=0.01)
@@ -136,9 +135,8 @@ def test_takes_of_another_arm_that_are_open_cannot_be_learned_for_this_one(page)
     rows = np.column_stack([3 * u, page.session.robot.home + np.outer(u - 1, np.linspace(0.3, 0.1, 6))])
     header = ",".join(["t", *(f"joint{k}" for k in range(1, 7))])
     content = "\n".join([header, *(",".join(map(str, row)) for row in rows)]).encode()
-    page.claim(page["Open your demonstrations"], True)
     assert page.session.jobs.wait_idle(CHOOSING, 60)
-    page.claim(page["Choose files, or drop them here"], viser.UploadedFile("a.csv", content))
+    page.claim(page["Open a file, or drop it here"], viser.UploadedFile("a.csv", content))
     for title, learns in (("JACO", True), ("Franka Panda", False), ("JACO", True)):
         choose(page, title)
         for lane in (CHOOSING, LANE, SEEING):

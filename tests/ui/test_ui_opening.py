@@ -51,12 +51,8 @@ class Opening:
     def labels(self):
         return {handle.label for handle in self.page.inputs if handle.visible}
 
-    def open(self):
-        self.page.claim(self["Open your demonstrations"], True)
-        self.done()
-
     def add(self, name, content):
-        self.page.claim(self["Choose files, or drop them here"], viser.UploadedFile(name, content))
+        self.page.claim(self["Open a file, or drop it here"], viser.UploadedFile(name, content))
         self.done()
 
     def choose(self, label, value):
@@ -82,7 +78,6 @@ def _opened(server, robot, monkeypatch):
     page, told = Page(server, robot), []
     monkeypatch.setattr(page.session, "say", lambda text, _severity: told.append(text))
     opened = Opening(page, told)
-    opened.open()
     yield opened
     page.close()
     server.gui.reset()
@@ -90,7 +85,7 @@ def _opened(server, robot, monkeypatch):
 
 
 def test_what_is_opened_is_seen_in_place_of_the_motion_until_it_is_cancelled(opened):
-    assert not opened.takes.visible and opened["Learn"].disabled
+    assert not opened.takes.visible
     opened.add("a.csv", csv())
     assert opened.takes.visible and opened.num_drawn == 1 and not opened["Learn"].disabled
     opened.add("b.zip", zipped(b=csv(jitter=0.002), c=csv(GOAL + np.array([-0.3, 0.0, 0.2])), d=csv()))
@@ -101,7 +96,7 @@ def test_what_is_opened_is_seen_in_place_of_the_motion_until_it_is_cancelled(ope
     visible = opened.page.visitor.pictures._always[-1]
     assert not visible.visible
     opened.choose("Cancel", True)
-    assert not opened.takes.visible and visible.visible and opened["Learn"].disabled
+    assert not opened.takes.visible and visible.visible
     assert {"Smooth jitter", "Use this take"}.isdisjoint(opened.labels())
     assert opened.page.session.scenario.task == "draw_s"
 
@@ -251,12 +246,22 @@ def test_forged_values_are_refused(opened, claim):
     assert opened.num_drawn == 1 and opened.told == []
 
 
-def test_a_file_for_a_folder_that_is_hidden_is_not_read(opened):
-    upload = opened["Choose files, or drop them here"]
+def test_after_cancel_the_next_file_is_the_only_one(opened):
+    opened.add("a.csv", csv())
     opened.choose("Cancel", True)
-    opened.page.claim(upload, viser.UploadedFile("a.csv", csv()))
-    opened.done()
-    assert not opened.takes.visible and opened.told == []
+    assert not opened.takes.visible
+    opened.add("b.csv", csv())
+    assert opened.takes.visible and opened.num_drawn == 1 and opened.takes.name.text == "b"
+
+
+def test_the_folder_goes_again_with_a_first_file_that_cannot_be_read(opened):
+    opened.add("a.csv", b"no numbers")
+    assert len(opened.told) == 1 and opened.told[0].startswith("a: ")
+    containers = opened.page.gui._container_handle_from_uuid.values()
+    (folder,) = (each for each in containers if getattr(each, "label", "") == "Your data")
+    assert not folder.visible
+    opened.add("b.csv", csv())
+    assert folder.visible and opened.num_drawn == 1
 
 
 def test_another_task_ends_what_is_open(opened):
@@ -269,9 +274,7 @@ def test_two_visitors_open_at_the_same_instant_and_each_sees_its_own(robot, open
     beside = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     other = Page(beside, robot)
     try:
-        other.claim(other["Open your demonstrations"], True)
-        assert other.session.jobs.wait_idle(CHOOSING, PATIENCE)
-        label = "Choose files, or drop them here"
+        label = "Open a file, or drop it here"
         opened.page.claim(opened[label], viser.UploadedFile("a.csv", csv()))
         other.claim(other[label], viser.UploadedFile("b.zip", zipped(b=csv(), c=csv())))
         opened.done()

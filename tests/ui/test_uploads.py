@@ -3,7 +3,7 @@
 import pytest
 
 from dt_viz.errors import DataError
-from dt_viz.ui.gate import MalformedError, Upload
+from dt_viz.ui.transfers import MalformedError, Upload
 
 
 @pytest.fixture

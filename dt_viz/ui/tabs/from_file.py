@@ -84,6 +84,13 @@ class FileLoader:
 
         on_press(self.again, lambda: self._begin(self.load_again))
 
+    def takes(self, name: str, content: bytes) -> bool:
+        """Add what a file holds if its suffix says that this is a shape, and nothing else; return whether it does."""
+        is_shape = Path(name).suffix.lower() in MESH_SUFFIXES
+        if is_shape:
+            self._begin(partial(self.load, content, name, UNITS[self.unit.value]))
+        return is_shape
+
     def _begin(self, load: Callable[[], None]) -> None:
         session = self._bindings.session
         if session.jobs.busy(LANE):

@@ -1,4 +1,4 @@
-"""The folder "Your data": recordings of a visitor's own, seen in the scene before they are learned."""
+"""The button "Open a file", and the folder "Your data": a visitor's recordings, seen before they are learned."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import viser
 from dt_viz.errors import DataError
 from dt_viz.files.recordings import ARCHIVE, AXES, NO_COLUMN, Recordings
 from dt_viz.files.takes import READERS
-from dt_viz.files.uploads import make_ready
 from dt_viz.learning.inspection import FindingKind
+from dt_viz.obstacles.files import MESH_SUFFIXES
 from dt_viz.scenario.tasks import Task
 from dt_viz.session import opening
 from dt_viz.session.opening import LENGTHS, USUAL_RATES, Choices, Preview
@@ -69,29 +69,38 @@ take, when what is wanted is shown."""
 
 
 class OpenPanel:
-    """The folder of one visitor's panel, and the button that opens it."""
+    """The folder of one visitor's panel, and the button that takes files."""
 
     def __init__(
-        self, gui: viser.GuiApi, bindings: Bindings, show: Show, learn: Callable[[Session, Task], None], most: int
+        self,
+        gui: viser.GuiApi,
+        bindings: Bindings,
+        show: Show,
+        learn: Callable[[Session, Task], None],
+        most: int,
+        take: Callable[[str, bytes], bool],
     ) -> None:
-        """Build the controls where the panel is being built; files may have `most` bytes together."""
-        self._bindings, self._show, self._learn, self._most = bindings, show, learn, most
+        """Build the controls where the panel is being built; files may have `most` bytes together.
+
+        `take` is given the name and the content of each file first, and returns whether it holds something else.
+        """
+        self._bindings, self._show, self._learn, self._most, self._take = bindings, show, learn, most, take
         self._changing = threading.RLock()  # one thread reads, another inspects, and handlers close what is open
         self._opened = Opened()
         self._seen: Preview | None = None
         """What is shown of it."""
-        hint = f"recorded motions of your own: {FORMATS}"
-        begin = gui.add_button("Open your demonstrations", icon=viser.Icon.FOLDER_OPEN, hint=hint)
+        hint = (
+            f"a saved scenario; demonstrations of your own: {FORMATS}, several at once, or a zip of a folder; "
+            f"a mesh: {', '.join(suffix[1:] for suffix in MESH_SUFFIXES)}"
+        )
+        self.upload = gui.add_upload_button("Open a file, or drop it here", icon=viser.Icon.FOLDER_OPEN, hint=hint)
+        gui.add_html(drop_html(self.upload, most))
         self.folder = gui.add_folder("Your data", visible=False)
         with self.folder:
-            hint = f"{FORMATS}; several at once, one after another, or a zip of a folder"
-            self.upload = gui.add_upload_button("Choose files, or drop them here", icon=viser.Icon.UPLOAD, hint=hint)
-            gui.add_html(drop_html(self.upload, most))
             self.table = gui.add_html("")
             self.controls = self._add_controls(gui)
             start = gui.add_button("Learn", color=LIGHT.brand, disabled=True)
             cancel = gui.add_button("Cancel", color="gray")
-        self.controls["open"] = self._control(begin, lambda _pressed: self.open())
         self.controls["learn"] = self._control(start, lambda _pressed: self._press())
         self._control(cancel, lambda _pressed: self.close())
         bindings.show(lambda s: (s.task, s.scene), lambda _chosen: self.close())
@@ -141,24 +150,23 @@ class OpenPanel:
         dropdown("topic", "Topic", (NO_COLUMN,), partial(self._answer, "topic"), "of the bag, or frame, of the hand")
         return found
 
-    def open(self) -> None:
-        """Show the folder, and get ready for files."""
-        self.folder.visible, self.controls["open"].handle.visible = True, False
-        make_ready()
-
     def close(self, *, learns: bool = False) -> None:
         """Let go of what is open, and show what was shown before, or what it `learns` once that is known."""
         with self._changing:
             seen, self._seen, self._opened = self._seen, None, Opened()
-            self.folder.visible, self.controls["open"].handle.visible = False, True
+            self.folder.visible = False
             self._draw()
             if seen is not None:
                 self._show(None, None if learns else 0)
 
     def load(self, name: str, content: bytes) -> None:
-        """Have a file added to what is open; say why that cannot be. Nothing is done while the folder is hidden."""
+        """Have a file taken, or added to what is open; say why that cannot be."""
         session = self._bindings.session
-        if not self.folder.visible:
+        try:
+            if self._take(name, content):
+                return
+        except DataError as error:
+            session.say(str(error), Severity.ALARM)
             return
         with self._changing:
             files = (*self._opened.files, (name, content))
@@ -169,7 +177,7 @@ class OpenPanel:
                 accepted = f"at most {self._most / 1e6:.0f} MB; the command line takes more"
                 session.say(f"{name}: files: found {size / 1e6:.1f} MB in all; accepted: {accepted}", Severity.ALARM)
             else:
-                self._opened = replace(self._opened, files=files)
+                self._opened, self.folder.visible = replace(self._opened, files=files), True
                 session.jobs.submit(LANE, self._read)
 
     def _again(self) -> None:
@@ -198,6 +206,8 @@ class OpenPanel:
         except DataError as error:
             session.say(str(error), Severity.ALARM)
             self._change(opened.files, files=opened.files[: opened.num_read])
+            if not self._opened.files:
+                self.close()
         else:
             self._change(opened.files, recordings=known, num_read=len(opened.files))
             session.jobs.submit(SEEING, self._see, latest=True)
@@ -275,7 +285,7 @@ class OpenPanel:
         if seen is None:
             self.table.content = ""
             for name, control in self.controls.items():
-                control.handle.visible = control.handle.visible and name in ("open", "learn")
+                control.handle.visible = control.handle.visible and name == "learn"
             return
         titles = tuple(f"{k} · {take.inspection.name}"[:40] for k, take in enumerate(seen.takes, 1))
         self._offer("take", titles, self.controls["take"].value)
