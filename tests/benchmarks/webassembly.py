@@ -32,7 +32,8 @@ TRIPLE = "wasm32-unknown-unknown"
 LAYOUT = "e-m:e-p:32:32-p10:8:8-p20:8:8-i64:64-n32:64-S128-ni:1:10:20"
 """Sizes and places of values in WebAssembly, as LLVM writes them."""
 NODE = """
-const fs = require("fs"), [file, numbers, num, many] = process.argv.slice(2);
+import fs from "fs";
+const [file, numbers, num, many] = process.argv.slice(2);
 const code = new WebAssembly.Module(fs.readFileSync(file)), env = {};
 for (const { name } of WebAssembly.Module.imports(code)) env[name] = Math[name] || (() => { throw name; });
 const exports = new WebAssembly.Instance(code, { env }).exports;
@@ -110,7 +111,7 @@ def run(options: argparse.Namespace) -> int:
     with TemporaryDirectory() as name:
         folder = Path(name)
         np.concatenate(given).tofile(folder / "numbers")
-        (folder / "run.cjs").write_text(NODE)
+        (folder / "run.mjs").write_text(NODE)
         program = (
             f"import pathlib; from {__name__} import write_object; write_object(pathlib.Path({name!r}) / 'loop.o')"
         )
@@ -118,7 +119,7 @@ def run(options: argparse.Namespace) -> int:
         subprocess.run([sys.executable, "-c", program], check=True, env=plain)
         link = ["--no-entry", "--export-all", "--allow-undefined", "--initial-memory=67108864"]
         subprocess.run([linker, *link, "-o", folder / "loop.wasm", folder / "loop.o"], check=True)
-        command = ["node", folder / "run.cjs", folder / "loop.wasm", folder / "numbers", str(num), str(many)]
+        command = ["node", folder / "run.mjs", folder / "loop.wasm", folder / "numbers", str(num), str(many)]
         times, found = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout)
         size = (folder / "loop.wasm").stat().st_size
     off = float(np.abs(np.reshape(found, (num, 3)) - sums).max())
