@@ -32,8 +32,6 @@ MAX_PORT = 65535
 PROG = "dt-viz"
 MAX_PROCESSES, MOST_BY_DEFAULT = 64, 4
 """Largest number of processes that may be asked for, and that are taken unasked."""
-SWITCH = 0.0005
-"""Time, seconds, for which a thread keeps the interpreter: a frame of a drag asks for it dozens of times."""
 LOADED = 2.0
 """Time, seconds, within which compiled code is loaded, so that nothing is said of it."""
 MEASURE = "evaluate"
@@ -148,7 +146,6 @@ def _work(
     """Serve in this process until it is interrupted; return the exit status where it cannot begin."""
     from dt_viz.ui.patches import GateError  # noqa: PLC0415
 
-    sys.setswitchinterval(SWITCH)
     try:
         server = new_server(listening, share)
     except GateError as error:

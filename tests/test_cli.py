@@ -3,7 +3,6 @@
 import asyncio
 import re
 import signal
-import socket
 import subprocess
 import sys
 from contextlib import AsyncExitStack
@@ -12,12 +11,10 @@ import numpy as np
 import pytest
 from demo import PATIENCE, address, started
 
-from dt_viz import cli
 from dt_viz.cli import main
 from dt_viz.evaluate.protocol_client import LostError, ProtocolClient
 from dt_viz.learning import store
 from dt_viz.scenario.tasks import TASKS
-from dt_viz.serving.board import own_share
 from dt_viz.ui import server
 from dt_viz.ui.patches import GateError
 from dt_viz.ui.server import CLOSING
@@ -157,19 +154,3 @@ def test_it_explains_itself_and_what_is_wrong_and_measurements_are_a_subcommand(
 def test_numpy_is_not_imported_before_its_threads_are_limited():
     program = "import sys, dt_viz.cli; sys.exit('numpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
-
-
-def test_threads_of_a_server_have_the_interpreter_in_turn_ten_times_sooner_than_usual():
-    """Else a frame waits for 5 ms whenever it asks for the interpreter while something else computes."""
-    usual, seen = sys.getswitchinterval(), []
-
-    def new_server(_listening, _share):
-        seen.append(sys.getswitchinterval())
-        raise GateError("")
-
-    try:
-        with socket.socket() as listening:
-            assert cli._work(new_server, lambda *_: None, own_share(1), listening) == 2
-    finally:
-        sys.setswitchinterval(usual)
-    assert seen[0] <= 0.001

@@ -22,7 +22,8 @@ from tempfile import TemporaryDirectory
 
 import llvmlite.binding as llvm
 import numpy as np
-from numba import carray, cfunc, types
+from numba import cfunc, types
+from numba.np.numpy_support import carray
 
 from dt_viz.evaluate.options import TABLES, report, whole_number
 
