@@ -179,8 +179,10 @@ class ArmController:
 
     # --- What it does ---
 
-    def step(self, q: ArrayLike, dt: float) -> Array:
+    def step(self, q: ArrayLike, dt: float, *, looks: bool = True) -> Array:
         """Compute the joint velocities (n,), rad/s, for the next `dt` seconds of a robot at `q` (n,), rad.
+
+        The flow around obstacles is made anew where that is due, unless it is told not to look.
 
         Raises:
             ValueError: q is not one finite angle for each joint, or dt is not above 0.
@@ -199,7 +201,7 @@ class ArmController:
                 self._moved_to(q)
             assert self._progress is not None
             before = self._progress
-            flow.advance(before, dt)
+            flow.advance(before, dt, looks=looks)
             now = flow.image(before)
             gap = float(np.abs(now - q).max())
             rate = max(0.0, 1 - gap / settings.patience) if flow.cleared else 0.0
@@ -215,10 +217,13 @@ class ArmController:
             return tick.velocity.copy()
 
     def steps(self, q: ArrayLike, dt: float, num: int) -> Array:
-        """Compute the joint velocities (num, n), rad/s, of some steps in a row of a robot that does as it is told."""
+        """Compute the joint velocities (num, n), rad/s, of some steps in a row of a robot that does as it is told.
+
+        Nothing new is seen between them, so that obstacles are looked at before the first one only.
+        """
         q, velocities = np.array(q, float), np.empty((num, self.robot.num_joints))
         for k in range(num):
-            velocities[k] = self.step(q, dt)
+            velocities[k] = self.step(q, dt, looks=k == 0)
             q = q + dt * velocities[k]
         return velocities
 

@@ -60,12 +60,13 @@ class ObstacleFlow:
             self.make(progress)
             self._duration = self._clearing.duration
 
-    def advance(self, progress: Progress, dt: float) -> None:
+    def advance(self, progress: Progress, dt: float, *, looks: bool) -> None:
         """Make the flow anew where that is due: every few ticks where obstacles move, else after a change."""
         settings = self._settings
         if self.seen.speed > 0 and self.time > self.seen.time + settings.stale:
             self.see(self.seen.avoidance)
-        if self.time >= self._made + settings.look_period and (self.seen.speed > 0 or self.changed):
+        due = looks and self.time >= self._made + settings.look_period
+        if due and (self.seen.speed > 0 or self.changed):
             self.make(progress)
         rise = self._clearing.duration - self._duration
         self._duration += min(max(rise, -settings.easing * dt), 2 * settings.easing * dt)

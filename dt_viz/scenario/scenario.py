@@ -245,7 +245,7 @@ class Scenario:
             return self.arm, self.task, self.style, self.style_amount
         return self.arm, self.task, self.imitation, self.objective, self.state
 
-    @property
+    @cached_property
     def avoidance(self) -> Avoidance:
         """The transform that the page's obstacles belong to; one without obstacles if the stack has none."""
         of_stack = (layer.transform for layer in self.stack if isinstance(layer.transform, Avoidance))

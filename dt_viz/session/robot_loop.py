@@ -22,7 +22,9 @@ class RoundSettings:
     """Settings of `LiveArm`."""
 
     tick: float = 0.01
-    """Time between two ticks of the controller, seconds: 100 Hz."""
+    """Shortest time from one tick of the controller to the next, seconds: 100 Hz."""
+    most: int = 5
+    """Number of ticks at once, at most: they are longer where the robot's thread is late."""
     longest: float = 0.25
     """Longest time that the robot moves at once, seconds: a thread that was held up does not make it rush."""
     rest: float = 0.8
@@ -214,16 +216,18 @@ class LiveArm:
             controller.watch()
             return
         self._due = min(self._due + seconds, settings.longest)
-        ticks = int(self._due / settings.tick)
-        self._due -= ticks * settings.tick
-        if ticks:
+        num = int(self._due / settings.tick)
+        tick = max(settings.tick, self._due / settings.most)
+        passed = min(num, settings.most) * tick
+        self._due -= passed
+        if num:
             q = self._q
             assert q is not None
-            velocities = controller.steps(q, settings.tick, ticks)
+            velocities = controller.steps(q, tick, min(num, settings.most))
             with self._changing:
                 if self._q is q:  # or it was put elsewhere meanwhile
-                    self._q = q + settings.tick * velocities.sum(axis=0)
-        self._go_round(controller, ticks * settings.tick)
+                    self._q = q + tick * velocities.sum(axis=0)
+        self._go_round(controller, passed)
 
     # --- On the thread that moves it ---
 

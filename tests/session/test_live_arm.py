@@ -1,5 +1,6 @@
 """The arm that moves: it goes its round, never jumps, gives way, and goes on from wherever it is taken."""
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from scenes import changed
 
 from dt_viz.control.controller import ArmController, Phase
+from dt_viz.control.obstacle_flow import ObstacleFlow
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.metrics import distance_from_path
 from dt_viz.obstacles.shapes import Sphere, as_point
@@ -296,3 +298,35 @@ def test_the_undisturbed_posture_is_on_the_learned_motion(begin, initial, space)
         assert np.linalg.norm(learned - hand, axis=1).min() < 6e-3
         apart = max(apart, float(np.linalg.norm(hand - loop.hand)))
     assert apart > 0.03
+
+
+def test_an_arm_whose_thread_is_late_moves_as_far_in_few_ticks_and_looks_once_for_all(begin, initial, monkeypatch):
+    scenario = changed(initial("push_box"), space="cspace")
+    counts = Counter()
+
+    def counted(kind, name):
+        before = getattr(kind, name)
+
+        def counts_and_does(*arguments, **options):
+            counts[name] += 1
+            return before(*arguments, **options)
+
+        monkeypatch.setattr(kind, name, counts_and_does)
+
+    counted(ArmController, "step")
+    counted(ObstacleFlow, "make")
+    found = []
+    for period in (SETTINGS.tick, 0.2):
+        arm = begin(scenario).arm
+        counts.clear()
+        (obstacle,) = scenario.obstacles
+        for k in range(10):
+            moved = obstacle.moved(as_point(np.add(obstacle.position, (0.0, 0.0, 0.004 * k))))
+            arm.see(changed(scenario, obstacles=(moved,)).arm_avoidance)
+            for _ in range(round(0.2 / period)):
+                arm.advance(period, moves=True)
+        found.append((Counter(counts), arm.left))
+    (usual, left), (late, left_late) = found
+    assert (usual["step"], late["step"]) == (pytest.approx(200, abs=1), 10 * SETTINGS.most)
+    assert late["make"] <= 10 < usual["make"]
+    assert 0 < left < 0.95 and abs(left - left_late) < 0.03
