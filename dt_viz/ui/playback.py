@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -19,12 +20,22 @@ logger = logging.getLogger(__name__)
 
 LANE = "arm"
 """Lane of the jobs on which the arm moves."""
-SHORTEST, LONGEST = 1 / 20, 1 / 6
-"""Bounds of the time from one picture of the arm to the next, seconds."""
-ASLEEP = 0.5
-"""The same while the arm waits for its page to be touched, seconds."""
-PART = 1 / 12
-"""Part of that time that moving and drawing the arm takes, at most: the more visitors there are, the fewer pictures."""
+
+
+@dataclass(frozen=True)
+class PlaybackSettings:
+    """How often arms are drawn; times in seconds."""
+
+    shortest: float = 1 / 20
+    """Shortest time from one picture of an arm to the next."""
+    longest: float = 1 / 3
+    """Longest time from one picture to the next, at most `RoundSettings.longest`, or the arm falls behind."""
+    asleep: float = 0.5
+    """Time from one look at whether the page is touched to the next, while the arm waits for that."""
+    part: float = 1 / 12
+    """Part of its time that moving and drawing an arm takes, at most."""
+    part_of_all: float = 1 / 3
+    """Part of a process' time that all arms take together, at most: the more visitors, the fewer pictures of each."""
 
 
 class Replay:
@@ -71,14 +82,18 @@ class Replay:
 class Playback:
     """Moves the arm, beside the server's event loop, and has it drawn where it is another one than before."""
 
-    def __init__(self, live: LiveArm, draw: Callable[[], None]) -> None:
+    def __init__(
+        self, live: LiveArm, draw: Callable[[], None], settings: PlaybackSettings = PlaybackSettings()
+    ) -> None:
         """Take the arm in the loop, and what draws it; it moves from `begin` on."""
         self.live, self.replay = live, Replay()
         self.arm: LiveArm | Replay = live
         """What moves now, with its joint angles `q` and `undisturbed`, (n,), rad, and the time since it `arrived`."""
         self.neglected = False
         """Whether nobody has touched the page for a while, and others need the processor: the goal is not left then."""
-        self._draw = draw
+        self.num_arms = 1
+        """Number of arms that this process moves."""
+        self._draw, self._settings = draw, settings
         self._playing, self._speed = True, 1.0
 
     @property
@@ -107,7 +122,7 @@ class Playback:
         self._draw()
 
     def _loop(self, jobs: Jobs, fail: Callable[[Exception], None]) -> None:
-        period = SHORTEST
+        period = self._settings.shortest
         before = time.monotonic()
         while True:
             jobs.rest(LANE, max(0.0, before + period - time.monotonic()))
@@ -120,4 +135,10 @@ class Playback:
                 logger.exception("the arm stopped")
                 self.live.stop()
                 fail(error)
-            before, period = now, ASLEEP if waits else min(max(SHORTEST, (time.monotonic() - now) / PART), LONGEST)
+            before, period = now, self._settings.asleep if waits else self._period(time.monotonic() - now)
+
+    def _period(self, taken: float) -> float:
+        """Time from one picture to the next where moving and drawing takes so long, seconds."""
+        settings = self._settings
+        part = min(settings.part, settings.part_of_all / self.num_arms)
+        return min(max(settings.shortest, taken / part), settings.longest)

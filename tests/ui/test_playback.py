@@ -11,10 +11,10 @@ from pages import PATIENCE
 from dt_viz.session.engine import ArmMotion
 from dt_viz.session.jobs import Jobs
 from dt_viz.session.robot_loop import RoundSettings
-from dt_viz.ui import playback as playback_module
-from dt_viz.ui.playback import Playback, Replay
+from dt_viz.ui.playback import Playback, PlaybackSettings, Replay
 
 PICTURE, REST = 0.02, RoundSettings().rest
+FAST = PlaybackSettings(shortest=1 / 200, asleep=1 / 100)
 
 
 class Arm:
@@ -36,9 +36,10 @@ def unexpected(error):
     pytest.fail(str(error))
 
 
-def playback_of(arm, draw, fail=None):
+def playback_of(arm, draw, fail=None, settings=FAST, num_arms=1):
     """A playback of such an arm; what keeps it from moving fails the test, unless it is taken."""
-    playback, jobs = Playback(cast(Any, arm), draw), Jobs(unexpected)
+    playback, jobs = Playback(cast(Any, arm), draw, settings), Jobs(unexpected)
+    playback.num_arms = num_arms
     playback.begin(jobs, fail or unexpected)
     return playback, jobs
 
@@ -48,7 +49,8 @@ class Player:
 
     def __init__(self):
         self.arm, self.places = Arm(), []
-        self.playback, self.jobs = playback_of(self.arm, self.draw)
+        asleep = PlaybackSettings(shortest=1e4)  # its thread sleeps until it is closed
+        self.playback, self.jobs = playback_of(self.arm, self.draw, settings=asleep)
 
     def draw(self):
         if self.playback.arm.q is not None:
@@ -68,8 +70,7 @@ def ramp(begin, end, seconds):
 
 
 @pytest.fixture
-def player(monkeypatch):
-    monkeypatch.setattr(playback_module, "SHORTEST", 1e4)  # its thread sleeps until it is closed
+def player():
     player = Player()
     yield player
     player.jobs.close()
@@ -87,16 +88,14 @@ def test_both_arms_are_shown_at_the_same_moment(moment):
         np.testing.assert_allclose(got, [np.interp(moment, times, angle) for angle in path.T], atol=1e-12)
 
 
-def test_the_arm_moves_without_being_asked_to(monkeypatch):
-    monkeypatch.setattr(playback_module, "SHORTEST", 1 / 200)
+def test_the_arm_moves_without_being_asked_to():
     arm, moved = Arm(), threading.Event()
     _, jobs = playback_of(arm, lambda: moved.set() if arm.q[0] > 0.1 else None)
     assert moved.wait(PATIENCE)
     jobs.close()
 
 
-def test_an_arm_that_cannot_move_is_said_to_and_waits_for_its_next_motion(monkeypatch):
-    monkeypatch.setattr(playback_module, "SHORTEST", 1 / 200)
+def test_an_arm_that_cannot_move_is_said_to_and_waits_for_its_next_motion():
     arm: Any = Arm()
     said, moved = [], threading.Event()
     advance = arm.advance
@@ -124,8 +123,8 @@ def test_nothing_moves_before_it_begins():
     jobs.close()
 
 
-def test_the_longer_a_picture_takes_the_fewer_there_are(monkeypatch):
-    monkeypatch.setattr(playback_module, "SHORTEST", 1e-3)
+@pytest.mark.parametrize(("num_arms", "part"), [(1, 1 / 12), (4, 1 / 12), (8, 1 / 24)])
+def test_the_longer_a_picture_takes_and_the_more_arms_there_are_the_fewer_there_are(num_arms, part):
     begun, enough = [], threading.Event()
 
     def draw():
@@ -134,15 +133,18 @@ def test_the_longer_a_picture_takes_the_fewer_there_are(monkeypatch):
         if len(begun) > 5:
             enough.set()
 
-    _, jobs = playback_of(Arm(), draw)
+    settings = PlaybackSettings(shortest=1e-3, part=1 / 12, part_of_all=1 / 3)
+    _, jobs = playback_of(Arm(), draw, settings=settings, num_arms=num_arms)
     assert enough.wait(PATIENCE)
     jobs.close()
-    assert np.diff(begun)[1:].min() > 0.9 * 0.005 / playback_module.PART
+    assert np.diff(begun)[1:].min() > 0.9 * 0.005 / part
 
 
-def test_the_arm_of_a_neglected_page_comes_to_the_goal_and_rests_there_until_it_is_touched(monkeypatch):
-    monkeypatch.setattr(playback_module, "SHORTEST", 1 / 200)
-    monkeypatch.setattr(playback_module, "ASLEEP", 1 / 100)
+def test_an_arm_never_falls_behind_however_few_pictures_there_are():
+    assert PlaybackSettings().longest < RoundSettings().longest
+
+
+def test_the_arm_of_a_neglected_page_comes_to_the_goal_and_rests_there_until_it_is_touched():
     arm: Any = Arm()
     arm.note = "as the arm says"
     drawn, playback = threading.Semaphore(0), cast(Playback, None)
