@@ -34,7 +34,11 @@ class Jobs:
         whose work is superseded.
         """
         self._fail, self._account, self._wake = fail, account, wake
-        self._changed = threading.Condition()
+        self._lock = threading.Lock()
+        self._news: dict[str, threading.Condition] = {}
+        """Notified of new work, for each lane that has rested: what is news for one lane wakes no other one."""
+        self._idle, self._left = threading.Condition(self._lock), threading.Condition(self._lock)
+        """Notified when a lane has nothing to do any more, and when the visitor leaves."""
         self._lanes: dict[str, deque[Work]] = {}
         """Work that waits, of each lane that has a thread."""
         self._threads: dict[str, int] = {}
@@ -48,7 +52,7 @@ class Jobs:
         Returns:
             Number of the works that waited and were dropped for the latest one.
         """
-        with self._changed:
+        with self._lock:
             if self.closed:  # a control that still moves while its page goes away
                 return 0
             dropped = self._drop(lane) if latest else 0
@@ -59,7 +63,6 @@ class Jobs:
                 # it waits until this lets go; a lane without a thread, where none can start, would be busy for ever
                 threading.Thread(target=self._run, args=(lane,), name=lane, daemon=True).start()
                 self._lanes[lane] = deque([work])
-            self._changed.notify_all()
             return dropped
 
     def busy(self, lane: str) -> bool:
@@ -72,31 +75,34 @@ class Jobs:
 
     def rest(self, lane: str, seconds: float) -> None:
         """Pause the work of a lane, which calls this, for so long or until it is superseded."""
-        with self._changed:
-            self._changed.wait_for(lambda: self.superseded(lane), seconds)
+        with self._lock:
+            news = self._news.setdefault(lane, threading.Condition(self._lock))
+            news.wait_for(lambda: self.superseded(lane), seconds)
 
     def pause(self, seconds: float) -> None:
         """Pause the work of a lane, which calls this, for so long, whatever waits, or until the visitor has left."""
-        with self._changed:
-            self._changed.wait_for(lambda: self.closed, seconds)
+        with self._left:
+            self._left.wait_for(lambda: self.closed, seconds)
 
     def wait_idle(self, lane: str | None = None, timeout: float | None = None) -> bool:
         """Wait until a lane, or each, has nothing to do; False if that took longer than `timeout` seconds."""
-        with self._changed:
-            return self._changed.wait_for(lambda: not (self.busy(lane) if lane else self._lanes), timeout)
+        with self._idle:
+            return self._idle.wait_for(lambda: not (self.busy(lane) if lane else self._lanes), timeout)
 
     def close(self) -> None:
         """Drop what waits: the visitor has left. What runs is not waited for."""
-        with self._changed:
+        with self._lock:
             self.closed = True
             for lane in self._lanes:
                 self._drop(lane)
                 self._supersede(lane)
-            self._changed.notify_all()
+            self._left.notify_all()
 
     def _supersede(self, lane: str) -> None:
         if lane in self._threads:
             self._wake(self._threads[lane])
+        if lane in self._news:
+            self._news[lane].notify_all()
 
     def _drop(self, lane: str) -> int:
         waiting = self._lanes.get(lane, deque())
@@ -106,12 +112,12 @@ class Jobs:
 
     def _run(self, lane: str) -> None:
         while True:
-            with self._changed:
+            with self._lock:
                 self._threads[lane] = threading.get_ident()
                 waiting = self._lanes[lane]
                 if not waiting:
                     del self._lanes[lane], self._threads[lane]
-                    self._changed.notify_all()
+                    self._idle.notify_all()
                     return
                 work = waiting.popleft()
             try:

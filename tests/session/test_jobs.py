@@ -238,3 +238,23 @@ def test_a_lane_whose_thread_cannot_start_works_as_soon_as_one_can(jobs, monkeyp
     jobs.note("next")
     jobs.settle()
     assert jobs.done == ["next"]
+
+
+def test_work_for_one_lane_does_not_wake_another_one_that_rests():
+    asked = threading.Semaphore(0)
+
+    class Counting(Jobs):
+        def superseded(self, lane):
+            if lane == LANE:
+                asked.release()
+            return super().superseded(lane)
+
+    jobs = Counting(lambda error: pytest.fail(str(error)))
+    jobs.submit(LANE, lambda: jobs.rest(LANE, PATIENCE))
+    assert asked.acquire(timeout=PATIENCE)  # it rests now, or is about to
+    for _ in range(20):
+        jobs.submit("another", lambda: None)
+        assert jobs.wait_idle("another", PATIENCE)
+    assert not asked.acquire(blocking=False) and jobs.busy(LANE)
+    jobs.submit(LANE, lambda: None)
+    assert asked.acquire(timeout=PATIENCE) and jobs.wait_idle(timeout=PATIENCE)
