@@ -90,10 +90,10 @@ class Cores:
                 self._left.notify_all()
 
     def wake(self, thread: int) -> None:
-        """Have a thread that waits for a slot ask at once whether that is still wanted."""
+        """Have a thread that waits for a slot, to refine, ask at once whether that is still wanted."""
         with self._lock:
             for place in self.queue:
-                if place.thread == thread:
+                if place.thread == thread and place.refines:
                     place.woken.set()
 
     def give_way(self) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -108,7 +108,11 @@ class Engine:
         return task, oldest
 
     def frames(
-        self, scenario: Scenario, progress: Progress | None = None, cancelled: Cancelled = never
+        self,
+        scenario: Scenario,
+        progress: Progress | None = None,
+        cancelled: Cancelled = never,
+        newest: Callable[[Scenario], Scenario] = lambda scenario: scenario,
     ) -> Iterator[Frame]:
         """Frames for a scenario, one for each stage; stop iterating to skip what is not wanted any more.
 
@@ -116,6 +120,7 @@ class Engine:
             scenario: what to show.
             progress: told how far learning is; see `dt_viz.learning.imitation.fit`.
             cancelled: asked after stage LIVE, before each part of the computation and while it waits for a slot.
+            newest: asked, once there is a slot, for the scenario to compute: it, or one with another stack.
 
         Raises:
             DemonstrationError: the task's demonstrations cannot be read.
@@ -133,6 +138,7 @@ class Engine:
         others = {panel: Scenario(panel.task, state=panel.state, arm=scenario.arm) for panel in shown}
         learned = {panel: self.nominal(other, learn).learned for panel, other in others.items()}
         with _cores.slot():
+            scenario = newest(scenario)
             frame = self._rollouts(scenario, LIVE)
         yield frame
         with _cores.slot():

@@ -19,7 +19,8 @@ class Jobs:
     """Executor of one visitor. A lane has a thread while it has work, so lanes wait for nobody else.
 
     Running work is never cancelled from outside (that would show nothing until a drag ends); it may ask `superseded`
-    between its parts and leave out the rest. What was submitted last to a lane is always done.
+    between its parts and leave out the rest, or do what waits, too, and `drop` it. Else what was submitted last to a
+    lane is always done.
     """
 
     def __init__(
@@ -64,6 +65,11 @@ class Jobs:
                 threading.Thread(target=self._run, args=(lane,), name=lane, daemon=True).start()
                 self._lanes[lane] = deque([work])
             return dropped
+
+    def drop(self, lane: str) -> int:
+        """Drop what waits on a lane; return how much that was."""
+        with self._lock:
+            return self._drop(lane)
 
     def busy(self, lane: str) -> bool:
         """Return whether a lane works."""

@@ -15,8 +15,8 @@ from dt_viz.session.frame import Frame, Stage
 from dt_viz.warning import Severity
 
 LIVE_PAUSE, LIVE_LATENCIES = 0.05, 2.0
-"""Shortest time between two drawings of the field while edits come faster, in seconds and in latencies of the rollouts:
-these are drawn more often, the more so the longer they take."""
+"""Shortest time between two drawings of the field while edits come faster, in seconds and in times that the rollouts
+take with what they wait for: these are drawn more often, the more so the longer they take."""
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class Screen:
                 kept = message if message is not None and message.scenario == frame.scenario else None
                 self.tell(shown=frame, pace=self._pace, learning=None, failed=False, message=kept)
 
-    def live_pause(self) -> float:
-        """Time until the field is due to be drawn again, seconds."""
+    def live_pause(self, taken: float) -> float:
+        """Time until the field is due to be drawn again, where the rollouts took so long, seconds."""
         last = self._live_frames[-1] if self._live_frames else -math.inf
-        return last + max(LIVE_PAUSE, LIVE_LATENCIES * self._pace.latency) - time.perf_counter()
+        return last + max(LIVE_PAUSE, LIVE_LATENCIES * taken) - time.perf_counter()

@@ -86,6 +86,10 @@ class Session:
         """The newest frame; None before the first one."""
         self._num_skipped = self._num_edits = 0
         """Edits that a newer one overtook, and all."""
+        self._computed = self.scenario
+        """Scenario that is computed now, or was last."""
+        self._edited = 0.0
+        """Time of the newest edit, of `time.perf_counter`."""
         self.jobs = Jobs(self.fail, account, wake)
         """All work of the visitor beside the server's event loop."""
         self._adopt()
@@ -336,12 +340,14 @@ class Session:
         if engine is not None:
             engine.see(self.scenario)
         self._num_edits += 1
-        work = partial(self._compute, self.scenario, time.perf_counter())
+        self._edited = time.perf_counter()
+        work = partial(self._compute, self.scenario, self._edited)
         self._num_skipped += self.jobs.submit(LANE, work, latest=True)
 
     def _compute(self, scenario: Scenario, edited: float) -> None:
         """Show the frames of a scenario that was wanted at a time, of `time.perf_counter`."""
         superseded = partial(self.jobs.superseded, LANE)
+        self._computed = scenario
         try:
             self._show_frames(self._decided(scenario), edited, superseded)
         except UnwantedError:
@@ -349,8 +355,8 @@ class Session:
         except Exception as error:
             with self._lock:
                 self._screen.tell(failed=True)
-                returned = isinstance(error, DataError | ImitationError) and self._retreat(scenario)
-                if not returned and self.scenario != scenario and not superseded():
+                returned = isinstance(error, DataError | ImitationError) and self._retreat(self._computed)
+                if not returned and self.scenario != self._computed and not superseded():
                     self._submit()  # it was edited meanwhile, and seemed to need no frames of its own
             if returned:
                 self._adopt()
@@ -380,9 +386,21 @@ class Session:
     def _show_frames(self, scenario: Scenario, edited: float, superseded: Callable[[], bool]) -> None:
         self._catch_up()
         learn = partial(self._learn, scenario)
-        engine = self.engines(scenario.arm, learn)
-        for frame in engine.frames(scenario, learn, superseded):
-            drawn = self._shown is not None and scenario.choices == self._shown.scenario.choices
+        engine, begun = self.engines(scenario.arm, learn), edited
+
+        def newest(before: Scenario) -> Scenario:
+            """Where somebody drags and others compute, the place in the queue is the same for the newest scenario."""
+            nonlocal edited
+            with self._lock:
+                newest = self.scenario
+                if replace(newest, stack=before.stack, passing=before.passing) != before or newest == before:
+                    return before
+                self._computed, edited = newest, self._edited
+                self._num_skipped += self.jobs.drop(LANE)
+            return self._decided(newest)
+
+        for frame in engine.frames(scenario, learn, superseded, newest):
+            drawn = self._shown is not None and frame.scenario.choices == self._shown.scenario.choices
             self._shown = frame
             if frame.stage is Stage.ROLLOUTS and drawn:
                 continue  # it is only looked at in another way: the next stage is what changes
@@ -392,7 +410,7 @@ class Session:
             if frame.stage is Stage.LIVE:
                 self.jobs.rest(LANE, REST)
             elif frame.stage is Stage.ROLLOUTS:
-                pause = self._screen.live_pause()
+                pause = self._screen.live_pause(time.perf_counter() - begun)
                 if pause <= 0:
                     continue  # the field is due, whatever is waiting
                 self.jobs.rest(LANE, pause)

@@ -47,7 +47,7 @@ class FakeEngine:
 
     def __init__(self):
         self.asked = []
-        self.begun, self.gate = threading.Event(), None
+        self.begun, self.gate, self.queue = threading.Event(), None, None
         self.unlearned, self.learning = set(), threading.Event()
         self.seen, self.driven, self.drivers = [], [], set()
         self.endless, self.busy = None, threading.Event()
@@ -58,9 +58,12 @@ class FakeEngine:
     def title(self, name):
         return name
 
-    def frames(self, scenario, progress=None, cancelled=never):
-        self.asked.append(scenario)
+    def frames(self, scenario, progress=None, cancelled=never, newest=lambda scenario: scenario):
         self.begun.set()
+        if self.queue is not None:
+            assert self.queue.wait(PATIENCE)
+            scenario = newest(scenario)
+        self.asked.append(scenario)
         if self.gate is not None:
             assert self.gate.wait(PATIENCE)
         while scenario.task in self.unlearned:
@@ -480,6 +483,47 @@ def test_edits_during_a_computation_are_overtaken_by_the_last(opened):
     # something is shown while dragging, field and arm unless they were drawn a moment ago; refined is only what rests
     assert stages in ([Stage.ROLLOUTS], [Stage.ROLLOUTS, Stage.LIVE])
     assert opened.page.paces[-1].num_skipped == 6
+
+
+class TestInTheQueue:
+    """What waits for a slot while others compute."""
+
+    @pytest.fixture
+    def waiting(self, opened):
+        opened.engine.begun.clear()
+        opened.engine.queue = threading.Event()
+        opened.edit("obstacle", obstacles=(at(0.0),))
+        assert opened.engine.begun.wait(PATIENCE)
+        return opened
+
+    def test_the_newest_of_a_drag_is_computed_when_its_turn_comes(self, waiting):
+        time.sleep(0.5)  # the latency is that of the newest edit
+        for x in range(1, 8):
+            waiting.edit("obstacle", obstacles=(at(float(x)),))
+        shown, edited = len(waiting.page.frames), time.perf_counter()
+        waiting.engine.queue.set()
+        waiting.settle()
+        assert [scenario.obstacles[0] for scenario in waiting.engine.asked[1:]] == [at(7.0)]
+        assert [frame.stage for frame in waiting.page.frames[shown:]] == [*Stage]
+        assert {frame.scenario for frame in waiting.page.frames[shown:]} == {waiting.session.scenario}
+        pace = waiting.page.paces[shown]
+        assert pace.num_skipped == 7 and pace.latency < time.perf_counter() - edited + 0.1
+        assert waiting.session.scenario.passing is not None
+
+    @pytest.mark.parametrize("change", [{"task": "draw_j"}, {"view": View(grid=True)}, {"warp": 0.5}])
+    def test_another_choice_than_of_the_stack_waits_for_its_own(self, waiting, change):
+        waiting.session.edit("another", **change)
+        waiting.engine.queue.set()
+        waiting.settle()
+        first, second = waiting.engine.asked[1:]
+        assert first.obstacles == (at(0.0),) and not any(getattr(first, name) == to for name, to in change.items())
+        assert all(getattr(second, name) == to for name, to in change.items())
+
+    def test_a_failure_of_the_newest_is_told_once(self, waiting):
+        waiting.edit("obstacle", temperature=13.0)
+        waiting.engine.queue.set()
+        waiting.settle()
+        assert len(waiting.page.errors) == 1 and waiting.page.progress.failed
 
 
 @pytest.mark.parametrize("seed", range(3))
