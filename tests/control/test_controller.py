@@ -104,7 +104,7 @@ class TestExactness:
 
 
 class TestArrival:
-    @pytest.mark.parametrize("seed", [*range(3), *(pytest.param(k, marks=pytest.mark.slow) for k in range(3, 12))])
+    @pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 12))])
     def test_from_postures_beside_the_section(self, scene, seed):
         """Each converges to the posture that the section has for the goal."""
         rng = np.random.default_rng(seed)
@@ -149,7 +149,7 @@ class TestArrival:
 
 
 class TestDisturbances:
-    @pytest.mark.parametrize("seed", range(3))
+    @pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 3))])
     def test_limits_hold_under_random_stacks_and_pushes(self, scene, seed):
         rng = np.random.default_rng(seed)
         robot = Robot(scene.controller(), scene.start)

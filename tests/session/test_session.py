@@ -261,13 +261,6 @@ def test_a_view_of_what_is_there_is_adopted_and_nothing_is_computed(opened, laye
     assert len(opened.engine.asked) == asked
 
 
-def test_a_view_is_no_step_of_undo_and_stays_when_others_are_taken_back(opened):
-    opened.edit("obstacle", obstacles=(at(1.0),))
-    opened.edit("ghost", view=View(ghost=False))
-    opened.session.undo()
-    assert opened.session.scenario == replace(fresh("draw_s"), view=View(ghost=False))
-
-
 @pytest.mark.parametrize("held", [False, True], ids=["a slider", "a drag, however slow"])
 def test_one_gesture_is_one_step_of_undo(opened, held):
     if held:
