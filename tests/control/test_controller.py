@@ -204,26 +204,6 @@ class TestDisturbances:
         robot.controller.follow(scene.solved)
         scene.assert_arrives(robot)
 
-    def test_the_hand_is_held_and_let_go(self, scene):
-        robot = scene.begun(1.0)
-        place = scene.middle + np.array([0.0, 0.0, 0.08])
-        robot.controller.hold(place)
-        robot.run(3)
-        assert robot.phases[-1] is Phase.HELD
-        np.testing.assert_allclose(scene.robot.end_effector(robot.q), place, atol=1e-3)
-        robot.controller.release()
-        scene.assert_arrives(robot)
-
-    def test_a_shove_takes_it_aside_and_it_goes_on_by_itself(self, scene):
-        robot = scene.begun(1.0)
-        free = np.array(Robot(scene.controller(), scene.start).run(4.0).passed)
-        aside = np.array([0.1, 0.1, -0.1, 0.0, 0.1, 0.0])
-        robot.controller.displace(robot.q + aside)
-        robot.run(1.0)
-        beside = min(np.abs(q - free - aside).max(axis=1).min() for q in robot.passed)
-        assert beside < 0.03  # so far beside the motion that goes on meanwhile
-        scene.assert_arrives(robot)
-
     @pytest.mark.parametrize("turns", [0, 1])
     def test_a_stack_of_the_hand_takes_over_where_the_motion_is(self, scene, engine, turns):
         """The base coordinates go on, so that the robot comes to the same motion seen through the new stack."""

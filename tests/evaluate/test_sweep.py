@@ -85,7 +85,6 @@ def kill_a_busy_worker(address, killed):
             time.sleep(0.01)
 
 
-@pytest.mark.slow
 def test_a_cluster_that_loses_a_worker_writes_what_one_process_does(commands, cluster, tmp_path):
     alone, killed = run(commands["around"], tmp_path / "alone"), []
     killer = threading.Thread(target=kill_a_busy_worker, args=(cluster.scheduler_address, killed))
@@ -96,6 +95,7 @@ def test_a_cluster_that_loses_a_worker_writes_what_one_process_does(commands, cl
     assert len(killed) == 1
 
 
+@pytest.mark.slow
 def test_an_item_that_ends_its_worker_is_computed_again_and_one_that_ends_each_is_given_up(
     cluster, tmp_path, monkeypatch
 ):

@@ -534,14 +534,6 @@ def test_what_the_controls_show_last_is_the_last_scenario_also_from_several_thre
     assert opened.page.adopted[-1] == opened.session.scenario
 
 
-def test_a_closed_session_computes_nothing_more(opened):
-    opened.session.close()
-    asked = len(opened.engine.asked)
-    opened.edit("obstacle", obstacles=(at(1.0),))
-    assert opened.session.wait_idle(PATIENCE)
-    assert len(opened.engine.asked) == asked
-
-
 def begin_learning(opened, task="lift_box"):
     opened.engine.unlearned = {task}
     opened.session.choose_task(task)
