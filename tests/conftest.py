@@ -24,10 +24,8 @@ for folder in (tempfile.tempdir, os.environ["XDG_CACHE_HOME"] + "/dt-viz"):
 
 import leftovers
 import pytest
-import viser  # noqa: TID251 - a page for tests of pictures and controls
 from chromium import ARGUMENTS, CHROMIUM
 from hypothesis import HealthCheck, settings
-from playwright.sync_api import sync_playwright
 from scenes import avoiding, frame_at
 
 from dt_viz.avoidance.arm import WholeArm
@@ -62,6 +60,8 @@ def _leaves_nothing_behind():
 
 @pytest.fixture(scope="module")
 def browser():
+    from playwright.sync_api import sync_playwright  # takes long to load
+
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
         yield browser
@@ -140,6 +140,8 @@ def initial(engine):
 @pytest.fixture(scope="module")
 def server():
     """A page that nobody looks at: its scene and controls take handles all the same."""
+    import viser  # noqa: TID251 - takes long to load
+
     server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     yield server
     server.stop()

@@ -3,7 +3,7 @@
     python -m tests.corruptions --seed 1 --count 60
 
 Each corruption turns a comparison, changes a sign, multiplies by 1.5, drops a term or exchanges two arguments, in a
-copy of the checkout. Then the quick tests of its package run, and those of the packages above, until one fails. What
+copy of the checkout. Then the quick tests of its package and the laws run, and then all others, until one fails. What
 survives is printed at the end: either it changes no result, or a test is missing.
 """
 
@@ -25,21 +25,8 @@ from queue import Queue
 from typing import Any
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("kernels", "flows", "learning", "transforms", "obstacles", "arm", "motion", "control", "engine", "ui")
-"""Packages that are corrupted."""
-ABOVE = {
-    "kernels": ("arm", "motion", "control", "engine"),
-    "flows": ("learning", "obstacles", "transforms", "arm", "motion", "pictures", "engine", "baselines"),
-    "learning": ("scenario", "motion", "engine", "baselines"),
-    "transforms": ("arm", "scenario", "motion", "engine", "ui"),
-    "obstacles": ("transforms", "arm", "scenario", "motion", "pictures", "engine", "baselines", "ui"),
-    "arm": ("motion", "control", "pictures", "engine", "baselines", "ui"),
-    "motion": ("control", "engine", "baselines", "ui"),
-    "control": ("engine", "evaluate", "ui"),
-    "engine": ("ui",),
-    "ui": ("browser",),
-}
-"""Folders of tests of the packages above each, nearest first."""
+PACKAGES = sorted(folder.name for folder in (ROOT / "tests").iterdir() if (ROOT / "dt_viz" / folder.name).is_dir())
+"""Packages that are corrupted: those with tests of their own."""
 TURNED = {ast.Lt: ">", ast.Gt: "<", ast.LtE: ">=", ast.GtE: "<=", ast.Eq: "!=", ast.NotEq: "=="}
 TURNED |= {ast.Is: "is not", ast.IsNot: "is", ast.In: "not in", ast.NotIn: "in"}
 SECONDS = 1200
@@ -169,9 +156,9 @@ def noticed_by(corruption: Corruption, root: Path) -> str:
     corruption.apply(root)
     try:
         own = [f"tests/{corruption.package}", "tests/laws"]
-        above = [f"tests/{name}" for name in ABOVE[corruption.package]]
-        rest = sorted(f"tests/{file.name}" for file in (root / "tests").glob("test_*.py"))
-        for folders in (own, above, rest):
+        found = [*(root / "tests").glob("*/test_*.py"), *(root / "tests").glob("test_*.py")]
+        rest = sorted(str(path.relative_to(root)) for path in found if f"tests/{path.parent.name}" not in own)
+        for folders in (own, rest):
             failed = _failing(root, folders)
             if failed:
                 return failed

@@ -93,8 +93,10 @@ def _ports() -> set[str]:
 
 def _files() -> set[str]:
     folders = (*WATCHED, Path(tempfile.gettempdir()), Path(os.environ["XDG_CACHE_HOME"]))
-    files = [file for folder in folders if folder.is_dir() for file in folder.iterdir()]
-    return {f"file {file}" for file in files if file.name not in HARMLESS and not file.name.startswith(OF_PYTEST)}
+    names = [(folder, name) for folder in folders if folder.is_dir() for name in os.listdir(folder)]  # noqa: PTH208 - Path's own takes ten times as long
+    return {
+        f"file {folder}/{name}" for folder, name in names if name not in HARMLESS and not name.startswith(OF_PYTEST)
+    }
 
 
 def _read(file: Path) -> str:

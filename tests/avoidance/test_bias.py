@@ -18,7 +18,7 @@ from dt_viz.metrics import resample_by_arc_length, sharpest_turn
 from dt_viz.motion.stack import FINE, LIVE, Solution, build_stack
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.scenario.scenario import Scenario
-from dt_viz.scenario.tasks import DRAWING_AXES, POTS
+from dt_viz.scenario.tasks import DRAWING_AXES
 from dt_viz.warning import Kind
 
 seeds = st.integers(0, 2**32 - 1)
@@ -248,19 +248,6 @@ def test_two_bias_points_in_either_order(nominal, task, order):
     assert satisfied(solution)
     assert max(missed(g, solution, point) for point in points) <= ACCEPTED
     assert_sound(g, solution)
-
-
-@pytest.mark.parametrize("pot", [POTS[0], pytest.param(POTS[2], marks=pytest.mark.slow)])
-def test_fig_8_the_object_falls_into_the_chosen_pot(nominal, pot):
-    g = nominal("drop_pots")
-    assert POTS[1].catches(g.goal) and not pot.catches(g.goal)
-    point = BiasPoint((pot.x, pot.y, float(g.goal[2])), moves_goal=True)
-    solution = biased(g, point)
-    goal = solution.built[0].made.goal
-    assert satisfied(solution) and pot.catches(goal)
-    assert np.linalg.norm(goal - point.position) <= ACCEPTED
-    assert_sound(g, solution, goal=goal)
-    assert (solution.bundle.positions[:, 2] > pot.height + 0.10).all()  # carried above the rims
 
 
 @pytest.mark.parametrize("level", [0, 1])

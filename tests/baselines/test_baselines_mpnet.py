@@ -16,7 +16,6 @@ from dt_viz.baselines.base import NotFittedError
 from dt_viz.baselines.mpnet import ARCHITECTURE, Network, Search
 from dt_viz.baselines.mpnet_training import SETTINGS, initial, loss_and_gradient, steps, train
 from dt_viz.baselines.postures import PlanningScene
-from dt_viz.baselines.registry import METHODS
 from dt_viz.errors import UnwantedError
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
@@ -160,10 +159,6 @@ class TestRRT:
         with pytest.raises(UnwantedError):
             planner(in_the_way, problem.task.starts[:1], cancelled)
         assert len(calls) == len(alone) + 20
-
-    def test_without_ompl_it_says_what_is_missing(self, monkeypatch):
-        monkeypatch.setattr("dt_viz.baselines.base.find_spec", lambda module: None)
-        assert METHODS["mpnet-rrt"].missing == ("ompl",) and METHODS["mpnet"].missing == ()
 
 
 class TestTraining:

@@ -7,7 +7,7 @@ from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui.server import Server
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def server(fits, robot):
     server = Server(TASKS, fits, robot, task="draw_s", port=0, max_sessions=2)
     yield server

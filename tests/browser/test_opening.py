@@ -1,7 +1,7 @@
 """A visitor's own recordings in a real browser: several files are chosen at once, or dropped, seen, and learned."""
 
 import pytest
-from browsing import DROP, PATIENCE, close_notices, close_page, open_page, press, take, wait_until
+from browsing import PATIENCE, close_notices, close_page, open_page, press, take, wait_until
 from chromium import needs_chromium
 
 pytestmark = [pytest.mark.browser, needs_chromium]
@@ -34,14 +34,3 @@ def test_six_files_chosen_at_once_are_seen_and_learned_by_a_click_and_undo_goes_
     assert page.get_by_role("textbox", name="Task").count() or page.locator("input[value='Your data']").count()
     press(page.get_by_role("button", name="Undo", exact=True))
     wait_until(lambda: visitor.shown is not None and visitor.shown.scenario.task == "draw_s", "the task before")
-
-
-def test_files_dropped_on_the_page_are_seen_and_cancel_goes_back(tab):
-    page, visitor = tab
-    wait_until(lambda: page.locator("input[type=file]").first.evaluate("input => input.multiple"), "the script")
-    page.evaluate(DROP, [[f"drop_{k}.csv", take().decode()] for k in range(2)])
-    page.get_by_text("drop_1").first.wait_for()
-    wait_until(lambda: visitor.pictures._takes.visible, "the takes in the scene")
-    press(page.get_by_role("button", name="Cancel"))
-    wait_until(lambda: not visitor.pictures._takes.visible, "the motion again")
-    assert visitor.session.scenario.task == "draw_s"

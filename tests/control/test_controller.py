@@ -104,7 +104,7 @@ class TestExactness:
 
 
 class TestArrival:
-    @pytest.mark.parametrize("seed", [*range(3), *(pytest.param(k, marks=pytest.mark.slow) for k in range(3, 12))])
+    @pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 12))])
     def test_from_postures_beside_the_section(self, scene, seed):
         """Each converges to the posture that the section has for the goal."""
         rng = np.random.default_rng(seed)
@@ -149,7 +149,7 @@ class TestArrival:
 
 
 class TestDisturbances:
-    @pytest.mark.parametrize("seed", range(3))
+    @pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 3))])
     def test_limits_hold_under_random_stacks_and_pushes(self, scene, seed):
         rng = np.random.default_rng(seed)
         robot = Robot(scene.controller(), scene.start)
@@ -202,26 +202,6 @@ class TestDisturbances:
         assert robot.phases[-1] is Phase.TOUCHED
         assert np.abs(robot.velocities[-1]).max() < 0.05
         robot.controller.follow(scene.solved)
-        scene.assert_arrives(robot)
-
-    def test_the_hand_is_held_and_let_go(self, scene):
-        robot = scene.begun(1.0)
-        place = scene.middle + np.array([0.0, 0.0, 0.08])
-        robot.controller.hold(place)
-        robot.run(3)
-        assert robot.phases[-1] is Phase.HELD
-        np.testing.assert_allclose(scene.robot.end_effector(robot.q), place, atol=1e-3)
-        robot.controller.release()
-        scene.assert_arrives(robot)
-
-    def test_a_shove_takes_it_aside_and_it_goes_on_by_itself(self, scene):
-        robot = scene.begun(1.0)
-        free = np.array(Robot(scene.controller(), scene.start).run(4.0).passed)
-        aside = np.array([0.1, 0.1, -0.1, 0.0, 0.1, 0.0])
-        robot.controller.displace(robot.q + aside)
-        robot.run(1.0)
-        beside = min(np.abs(q - free - aside).max(axis=1).min() for q in robot.passed)
-        assert beside < 0.03  # so far beside the motion that goes on meanwhile
         scene.assert_arrives(robot)
 
     @pytest.mark.parametrize("turns", [0, 1])

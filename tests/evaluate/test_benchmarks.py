@@ -20,6 +20,7 @@ from dt_viz.learning.augmented import fit_augmented
 from dt_viz.learning.imitation import fit
 from dt_viz.learning.timing import TimedAttractor
 from dt_viz.metrics import discrete_frechet, distance_from_path
+from dt_viz.obstacles import solids
 from dt_viz.obstacles.files import read_mesh
 from dt_viz.scenario.tasks import TASKS, known_tasks
 from dt_viz.session.engine import Engine
@@ -66,7 +67,7 @@ def test_what_is_found_again_just_after_a_choice_is_not_compared():
 # --- capacity ---
 
 
-@pytest.mark.parametrize("num_visitors", [1, 4, 12])
+@pytest.mark.parametrize("num_visitors", [1, 12])
 def test_a_simulated_process_answers_as_many_in_time_as_on_paper_while_it_has_time(num_visitors):
     cost = Cost(picture=0.04, looking=0.01, dragging=0.05)
     for within in (0.1, 0.5):
@@ -86,7 +87,7 @@ def test_more_visitors_of_a_process_are_answered_later_until_it_has_no_time_at_a
 # --- latency, drag, scenes ---
 
 
-@pytest.mark.parametrize("dragged", ["obstacle", "bias --obstacles 0"])
+@pytest.mark.parametrize("dragged", ["obstacle", pytest.param("bias --obstacles 0", marks=pytest.mark.slow)])
 def test_latency_counts_every_edit_and_reports_both_stages(measured, dragged, monkeypatch):
     recorder, frames = Recorder(), Engine.frames
 
@@ -108,7 +109,8 @@ def test_latency_counts_every_edit_and_reports_both_stages(measured, dragged, mo
 
 
 @pytest.mark.parametrize("shape", latency.SHAPES)
-def test_an_obstacle_of_any_shape_is_dragged_by_its_middle(shape):
+def test_an_obstacle_of_any_shape_is_dragged_by_its_middle(shape, monkeypatch):
+    monkeypatch.setattr(solids, "SETTINGS", solids.GridSettings(num_nodes=20_000))
     place, size = (0.1, -0.4, 0.3), 0.15
     vertices, _ = (obstacle := latency.SHAPES[shape](place, size)).surface()
     np.testing.assert_allclose((vertices.min(axis=0) + vertices.max(axis=0)) / 2, 0, atol=1e-3)
@@ -349,8 +351,6 @@ def test_commands_run_in_processes_of_their_own_and_their_tables_come_back(lasa,
     result = sitting.ran(["imitation", str(lasa / "Hook.mat")], tmp_path / "imitation-0")
     assert result["status"] == 0 and result["seconds"] > 0 and result["tables"][0][0]["name"] == "Hook"
     assert (tmp_path / "imitation-0" / "Hook.npz").exists()
-    failed = sitting.ran(["around", "--task", "nothing"], tmp_path / "around-0.npz")
-    assert failed["status"] == 2 and failed["tables"] == []
 
 
 @pytest.mark.parametrize("name", sitting.SUBJECTS)
@@ -412,7 +412,8 @@ def test_gaps_beside_are_compared_with_those_just_before_and_after(monkeypatch):
     assert row["done"] == "2" and len(begun) == 2
 
 
-def test_the_torus_is_a_closed_mesh_of_so_many_faces():
+def test_the_torus_is_a_closed_mesh_of_so_many_faces(monkeypatch):
+    monkeypatch.setattr(solids, "SETTINGS", solids.GridSettings(num_nodes=1000))
     solid, notes = read_mesh(fairness.torus(20, 30), "torus.stl")
     assert len(solid.faces) == 1200 and notes == ()
     np.testing.assert_allclose(np.ptp(solid.vertices, axis=0), [0.16, 0.16, 0.04], rtol=0.02)
@@ -432,6 +433,7 @@ def value(client, label, field):
     return client.controls[client.find(label)][field]
 
 
+@pytest.mark.slow
 def test_the_other_visitor_does_what_he_is_to_do(monkeypatch):
     monkeypatch.setattr(fairness, "OTHER", replace(fairness.OTHER, rings=(20, 30)))
     with started(["--task", "draw_s", "--processes", "1"]) as (url, _):

@@ -133,6 +133,7 @@ def test_all_visitors_who_come_and_drag_at_once_are_shown_their_last_edit(tmp_pa
     assert f"{NUM_VISITORS} of {NUM_VISITORS}" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_who_gives_way_is_chosen_and_visitors_of_a_started_server_who_look_on_cost_something(tmp_path, capsys):
     out = tmp_path / "rest.json"
     assert main(["load", "--rest", "--avoid", "off", "--clients", "1", "--seconds", "0.8", "--out", str(out)]) == 0

@@ -50,10 +50,8 @@ def run(command, folder, more=""):
     return written(folder)
 
 
-SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("reactive", "imitation", "table1")]
-
-
-@pytest.mark.parametrize("name", ["around", *SLOW])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["around", "reactive", "imitation", "table1"])
 def test_two_processes_write_what_one_does(commands, name, tmp_path):
     pytest.importorskip("joblib")
     alone = run(commands[name], tmp_path / "alone")
@@ -123,8 +121,12 @@ def test_an_item_that_ends_its_worker_is_computed_again_and_one_that_ends_each_i
         list(swept(lambda _, k: k, range(2)))
 
 
-def test_each_worker_keeps_what_items_share_and_its_errors_and_its_end_are_told():
+def test_each_worker_computes_what_one_process_does_keeps_what_items_share_and_its_errors_and_its_end_are_told():
     pytest.importorskip("joblib")
+
+    def product(_, k):
+        matrix = np.random.default_rng(k).normal(size=(90, 90))
+        return (matrix @ matrix).tobytes()
 
     def end(_, k):
         os.kill(os.getpid(), signal.SIGKILL)
@@ -136,6 +138,7 @@ def test_each_worker_keeps_what_items_share_and_its_errors_and_its_end_are_told(
         found = [each for _ in range(2) for each in swept(lambda shared, k: (k, shared), range(6))]
         assert [k for k, _ in found] == 2 * [*range(6)]
         shared = {shared for _, shared in found}
+        assert [*swept(product, range(4))] == [product(None, k) for k in range(4)]
         assert own not in shared and len(shared) == len({pid for pid, _ in shared}) <= 2
         with pytest.raises(FormatError, match="--x: found 2; accepted: 1"):
             list(swept(fail, range(2)))

@@ -1,15 +1,12 @@
 """The comparison: where the places are, what the cells are made from, and what stands beside them."""
 
 import json
-from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
 
-from dt_viz.baselines import mpnet
 from dt_viz.baselines.base import Plan
-from dt_viz.baselines.registry import METHODS, problem_of
+from dt_viz.baselines.registry import problem_of
 from dt_viz.errors import FormatError, never
 from dt_viz.evaluate import figures, table1
 from dt_viz.evaluate.__main__ import main
@@ -163,12 +160,6 @@ class TestMissing:
         assert main([*ARGUMENTS, "mpnet-rrt", "linear", "--out", str(tmp_path)]) == 1
         assert "MPNet-RRT needs ompl: pip install" in capsys.readouterr().err
         assert not (tmp_path / "table1.json").exists()
-
-    def test_a_method_that_was_not_trained_is_said(self, monkeypatch, tmp_path, capsys):
-        untrained = replace(METHODS["mpnet"], fit=partial(mpnet.fit, folder=tmp_path))
-        monkeypatch.setitem(METHODS, "mpnet", untrained)
-        assert main([*ARGUMENTS, "mpnet", "--out", str(tmp_path)]) == 1
-        assert "MPNet, Push box: mpnet has not been trained" in capsys.readouterr().err
 
 
 class TestFigure6:

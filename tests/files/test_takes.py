@@ -182,18 +182,6 @@ class TestText:
         content = table(["1", "2", "3", "4", "5"], RNG.normal(size=(5, 9)))
         assert "5 columns without names" in refusal(content, "a.csv")
 
-    def test_the_issues_bad_tables_are_refused_in_one_line(self):
-        good = table(["t", "x", "y"], [TIMES, *path_of()[:, :2].T]).decode().splitlines()
-        for text, words in (
-            (good[:2], "1 sample"),
-            ([*good[:5], good[4], *good[5:]], "times that increase"),
-            ([*good[:5], good[3], *good[5:]], "at line 6"),
-            ([*good[:5], "0.1,nan,0", *good[5:]], "nan at line 6"),
-            ([*good[:5], "0.07,0", *good[5:]], "line 6: found 2 columns"),
-            ([*good[:5], "0.07,0,1,2", *good[5:]], "line 6: found 4 columns"),
-        ):
-            assert words in refusal("\n".join(text).encode(), "a.csv")
-
 
 class TestArrays:
     def test_npy(self, tmp_path):
@@ -395,16 +383,6 @@ class TestJoints:
 
 
 class TestParquet:
-    def test_a_table(self, tmp_path):
-        pa, pq = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
-        columns = {
-            "time": TIMES,
-            **{f"ee_pos_{axis}": path_of()[:, k] for k, axis in enumerate("xyz")},
-            "note": ["a"] * 60,
-        }
-        pq.write_table(pa.table(columns), tmp_path / "a.parquet")
-        assert_same(load_demonstrations(tmp_path / "a.parquet")[0], path_of())
-
     def test_a_lerobot_data_set(self, tmp_path):
         lerobot(tmp_path / "places", ["x", "y", "z"])
         read = load_demonstrations(tmp_path / "places")

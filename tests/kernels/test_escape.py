@@ -4,7 +4,7 @@ import numpy as np
 import plain_escape
 import pytest
 from body_spheres import cover
-from laws.registry import OBSTACLES, TILTED
+from laws.registry import OBSTACLES, SIMILAR, TILTED
 
 from dt_viz.avoidance.arm import WholeArm
 from dt_viz.avoidance.arm_field import WholeArmField
@@ -33,7 +33,7 @@ class Plain:
 SEVERAL = ("torus", "sphere", "scan", "plate")
 
 
-@pytest.fixture(scope="module", params=["sphere", "box 3:1", "disc", "torus", "larger cloud", "several"])
+@pytest.fixture(scope="module", params=["sphere", "box 3:1", "larger cloud", "several"])
 def field(request):
     """The escape from one obstacle, or four, somewhere about the hand of the arm that is ready."""
     rng = np.random.default_rng(3)
@@ -64,9 +64,9 @@ def test_clearance_is_that_of_array_operations(field, postures):
     np.testing.assert_allclose(ARM.clearance(postures, Union(field.obstacles)), expected, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", OBSTACLES)
+@pytest.mark.parametrize("name", OBSTACLES.keys() - SIMILAR)
 def test_far_away_and_beyond_a_grid_distances_are_those_of_array_operations(name):
-    q, body = ROBOT.home + np.random.default_rng(6).normal(0, 1.0, (200, 6)), cover(ARM.body)
+    q, body = ROBOT.home + np.random.default_rng(6).normal(0, 1.0, (50, 6)), cover(ARM.body)
     for away in (0.2, 0.5, 2.0):
         part = OBSTACLES[name].moved((away, -0.4, 0.3), (0.3, 0.2, 0.9, 0.1))
         points = body.of_chain(ROBOT.chain(q.T)).transpose(0, 2, 1)
@@ -82,13 +82,12 @@ def test_runge_kutta_steps_are_those_of_array_operations(field, postures, durati
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-11)
 
 
-def test_adaptive_steps_are_as_exact_as_those_of_array_operations(field, postures):
-    """Not the same: array operations take the steps of the strictest posture for all."""
+def test_adaptive_steps_are_as_exact_as_fine_runge_kutta_steps(field, postures):
+    postures = postures[:20]
     before = postures.copy()
     exact, _ = carried(field, postures, None, RK4, -0.7, 2000)
-    for each in (Plain(field), field):
-        found, _ = carried(each, postures, None, DORMAND_PRINCE, -0.7, 1000, 1e-8)
-        np.testing.assert_allclose(found, exact, rtol=0, atol=5e-6)
+    found, _ = carried(field, postures, None, DORMAND_PRINCE, -0.7, 1000, 1e-8)
+    np.testing.assert_allclose(found, exact, rtol=0, atol=5e-6)
     np.testing.assert_array_equal(postures, before)
 
 

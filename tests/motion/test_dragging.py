@@ -2,6 +2,7 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -78,9 +79,15 @@ class Drag:
 ONE_SLOW = [("draw_s", "task"), pytest.param(("push_box", "cspace"), marks=pytest.mark.slow)]
 
 
+@pytest.fixture(scope="module")
+def between(initial, new_engine):
+    """The drag of a task in a space, through the place at which motions change sides."""
+    return cache(lambda task, space: Drag(initial, task, space).between_sides(new_engine()))
+
+
 @pytest.fixture(name="drag", params=DRAGS, ids=str)
-def _drag(request, initial, new_engine):
-    return Drag(initial, *request.param).between_sides(new_engine())
+def _drag(request, between):
+    return between(*request.param)
 
 
 def resampled(frame):

@@ -26,9 +26,10 @@ def inside_limits(robot: Robot, q: np.ndarray) -> bool:
 
 
 class TestInverseKinematics:
-    @pytest.mark.parametrize("seed", range(100))
-    def test_reaches_targets_with_a_natural_posture(self, robot, seed):
-        target = np.random.default_rng(seed).uniform(*BOX)
+    @settings(max_examples=30)
+    @given(seed=seeds)
+    def test_reaches_targets_with_a_natural_posture(self, seed):
+        robot, target = load_jaco(), np.random.default_rng(seed).uniform(*BOX)
         q = inverse_kinematics(robot, target)
         _, origins = robot.forward_kinematics(q)
         np.testing.assert_allclose(robot.end_effector(q), target, atol=1e-5)
@@ -38,7 +39,7 @@ class TestInverseKinematics:
         assert origins[2, 2] > 0.4  # elbow up
         assert robot.hand_direction(q)[2] < 0.1  # not upwards
 
-    @pytest.mark.parametrize("seed", range(10))
+    @pytest.mark.parametrize("seed", range(4))
     def test_stays_near_a_seed_that_already_reaches(self, robot, seed):
         natural = inverse_kinematics(robot, np.random.default_rng(seed).uniform(*BOX))
         q = natural + np.array([2 * np.pi, 0.0, 0.0, -2 * np.pi, 0.0, 1.0])  # other turns of the continuous joints
@@ -103,7 +104,7 @@ class TestTracking:
         q = self.follow(robot, np.concatenate([path, path[::-1]])).q
         np.testing.assert_allclose(q, q[::-1], atol=5e-3)
 
-    @pytest.mark.parametrize("seed", range(5))
+    @pytest.mark.parametrize("seed", range(2))
     def test_bridges_jumps_and_repeated_samples(self, robot, seed):
         path = smooth_path(seed)
         steps = np.linalg.norm(np.diff(path, axis=0), axis=1).cumsum()
@@ -112,7 +113,7 @@ class TestTracking:
         assert result.error.max() < 1e-4
         assert np.abs(np.diff(result.q, axis=0)).max() < 0.3
 
-    @pytest.mark.parametrize("seed", range(5))
+    @pytest.mark.parametrize("seed", range(2))
     def test_a_warm_start_ends_where_a_cold_one_does_and_is_not_written_to(self, robot, seed):
         path, rng = smooth_path(seed), np.random.default_rng(seed)
         cold = self.follow(robot, path)

@@ -44,12 +44,11 @@ each_arm = pytest.mark.parametrize("name", OTHERS)
 
 
 @pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory):
-    """A cache folder of this module's own."""
-    folder = tmp_path_factory.mktemp("cache")
-    (folder / "dt-viz").mkdir()  # not by the first test, which is to leave nothing behind
+def _arms_of_the_tests(cache):
+    """Arms are made once for the whole test run."""
+    (cache / "dt-viz").mkdir(parents=True, exist_ok=True)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(folder))
+        patch.setenv("XDG_CACHE_HOME", str(cache))
         yield
 
 
@@ -181,7 +180,7 @@ def test_courses_of_an_arm_whose_postures_are_not_unique_end_where_its_motions_d
 
 
 def test_the_jaco_in_the_cache_is_the_one_that_was_made(robot, monkeypatch):
-    models._load("jaco", None, stored=False)  # into this module's cache
+    models._load("jaco", None, stored=False)  # into the tests' cache
     monkeypatch.setattr(models._Given, "_robot", lambda *_: pytest.fail("it is made again"))
     again = models._load("jaco", None, stored=True)
     made, kept = to_arrays(robot), to_arrays(again)

@@ -1,11 +1,11 @@
 """Disturbances: what crosses the motion by itself, and a goal that moves."""
 
-import time
 from itertools import pairwise
 from typing import Any, cast
 
 import numpy as np
 import pytest
+from pages import wait_until
 from scenes import changed
 
 from dt_viz.obstacles.shapes import Box, Sphere
@@ -98,13 +98,6 @@ class Editable:
 
     def end_gesture(self):
         self.gestures.append("end")
-
-
-def wait_until(condition):
-    deadline = time.monotonic() + 20
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
 
 
 @pytest.mark.parametrize("taken", [False, True], ids=["stopped", "taken"])

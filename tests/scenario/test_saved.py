@@ -429,26 +429,6 @@ def test_each_value_replaced_by_any_other_is_refused_or_makes_a_scenario():
     assert 0.01 < np.mean(read) < 0.5
 
 
-@pytest.mark.parametrize(
-    "mutation",
-    [
-        hostile.flipped,
-        hostile.overwritten,
-        hostile.truncated,
-        hostile.without_block,
-        hostile.with_block_again,
-        hostile.with_word,
-        hostile.with_line_again,
-    ],
-)
-def test_damaged_texts_are_refused_or_make_a_scenario(mutation):
-    content, rng = encode(rich()).encode(), np.random.default_rng(0)
-    read = [
-        assert_refused_or_whole(mutation(content, rng)[:200_000].decode(errors="surrogateescape")) for _ in range(60)
-    ]
-    assert not all(read)
-
-
 def test_each_shape_of_the_figures_has_a_name():
     shapes = [
         obstacle.mesh if isinstance(obstacle, MeshObstacle) else obstacle.cloud

@@ -10,6 +10,9 @@ from dt_viz.serving.board import Board, Share
 from dt_viz.serving.listening import HandedOver, listen
 from dt_viz.serving.supervisor import Supervisor, SupervisorSettings
 
+RECENT = 0.2
+"""Time for which a connection that was handed over counts, seconds."""
+
 
 def main(kind: str = "", silence: str = "10") -> int:
     """Serve until SIGTERM; `kind` is what goes wrong."""
@@ -31,7 +34,9 @@ def main(kind: str = "", silence: str = "10") -> int:
         print(listening.getsockname()[1], flush=True)
 
     try:
-        return Supervisor(listening, Board(2, 100), work, ready, SupervisorSettings(silence=float(silence))).run()
+        return Supervisor(
+            listening, Board(2, 100), work, ready, SupervisorSettings(silence=float(silence), recent=RECENT)
+        ).run()
     except KeyboardInterrupt:
         return 0
 

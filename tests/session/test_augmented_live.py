@@ -54,14 +54,16 @@ NEED_MEMORY = {EIGHT, "draw_s_wavy"}
 """Tasks that the plain state does not draw."""
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize(
+    "task", [pytest.param(name, marks=[pytest.mark.slow] * (name not in {*NEED_MEMORY, "draw_s"})) for name in TASKS]
+)
 def test_what_ships_is_learned_in_the_plain_state_where_that_draws_it(fits, new_engine, task):
     demonstrations = TASKS[task]().demonstrations
     assert (missed(fits.get(demonstrations), demonstrations) > ImitationSettings().max_missed) == (task in NEED_MEMORY)
     for asked in STATES:
         imitation = new_engine().nominal(Scenario(task, state=asked)).imitation
         wanted = "augmented" if task in NEED_MEMORY else "plain"
-        assert imitation.state == (wanted if asked == "auto" else asked)
+        assert imitation.state == (wanted if asked == "auto" else asked) and imitation.known_labels == ()
         assert ("misses a demonstration" in imitation.reason) == (task in NEED_MEMORY and asked == "auto")
 
 
@@ -99,8 +101,7 @@ def found_labels(demonstrations):
     return augmented(demonstrations).known_labels
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("jitter", [0.0, 0.01, 0.03])
+@pytest.mark.parametrize(("jitter", "seed"), [(0.0, 0), (0.03, 1)])
 @pytest.mark.parametrize(
     ("heights", "labels"),
     [
@@ -125,8 +126,7 @@ def test_two_labels_are_found_for_two_sides(name, most):
     assert missed(imitation, demonstrations) < most
 
 
-@pytest.mark.parametrize("given", [False, True])
-@pytest.mark.parametrize("beside", [0.0, 0.05, 0.1, 0.2])
+@pytest.mark.parametrize(("beside", "given"), [(0.0, False), (0.1, True), (0.2, False)])
 def test_a_label_means_the_same_from_starts_beside_the_demonstrated_ones(beside, given):
     demonstrations = ways((-0.1, 0.1))
     imitation = augmented(demonstrations, 3 * (-1.0, 1.0) if given else None)
@@ -143,12 +143,6 @@ def test_labels_that_do_not_tell_what_was_drawn_are_said():
     assert not learn(demonstrations, state="augmented", labels=3 * (-1.0, 1.0)).warnings
     with pytest.raises(ImitationError, match=r"labels: found .*'left'.*; accepted: finite numbers"):
         learn(demonstrations, state="augmented", labels=3 * ("left", "right"))  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_one_pattern_gets_no_labels(fits, task):
-    imitation = fits.learned(TASKS[task]().demonstrations, state="augmented")
-    assert imitation.state == "augmented" and imitation.known_labels == ()
 
 
 def test_ways_that_begin_far_apart_are_told_by_their_starts():
@@ -387,8 +381,8 @@ def test_the_arm_draws_the_pattern_of_the_rollout_that_it_begins(new_engine, rol
 # --- The library ---
 
 
-@pytest.mark.parametrize("label", [-1.0, 1.0])
-def test_the_arm_in_the_loop_draws_the_pattern_of_its_label(label):
+def test_the_arm_in_the_loop_draws_the_pattern_of_its_label():
+    label = -1.0
     across, down = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, -1.0])
     turned = [
         replace(d, positions=np.array([0.1, -0.5, 0.15]) - d.positions[:, :1] * down + d.positions[:, 1:] * across)
@@ -439,8 +433,13 @@ def test_saved_motions_come_back_with_their_state_and_labels(tmp_path, given):
         motion.rollouts(start, label=3.0)
 
 
-def test_without_starts_a_label_chooses_the_demonstrations():
-    motion = dt.fit(ways((-0.1, 0.1)), state="augmented")
+@pytest.fixture(scope="module")
+def two_ways():
+    return dt.fit(ways((-0.1, 0.1)), state="augmented")
+
+
+def test_without_starts_a_label_chooses_the_demonstrations(two_ways):
+    motion = two_ways
     assert motion.demonstrated_labels == 3 * (-1.0, 1.0)
     every, low = motion.rollouts(), motion.rollouts(label=-1.0)
     assert len(every) == 6 and len(low) == 3
@@ -452,8 +451,7 @@ def test_without_starts_a_label_chooses_the_demonstrations():
         dt.fit(CASES["wide eight"].demonstrations).rollouts(label=1.0)
 
 
-@pytest.mark.parametrize("label", [-1.0, 1.0])
-@pytest.mark.parametrize("pushed", [False, True])
+@pytest.mark.parametrize(("label", "pushed"), [(-1.0, False), (1.0, True)])
 def test_the_hand_in_the_loop_draws_what_the_rollout_does(pushed, label):
     motion = dt.fit(ways((-0.1, 0.1), jitter=0.0), state="augmented").stack(
         dt.Avoidance(dt.Sphere((0.15, 0.1 * label, 0.0), diameter=0.04))
@@ -502,9 +500,9 @@ def test_the_hand_in_the_loop_of_a_plain_motion_needs_no_memory():
         (lambda m: dt.HandController(m, [0.3, 0.0]).step([0.3], 0.01), "position: found 1×1 numbers"),
     ],
 )
-def test_wrong_values_are_named(wrong, found):
+def test_wrong_values_are_named(two_ways, wrong, found):
     with pytest.raises(dt.FormatError, match=re.escape(found)):
-        wrong(dt.fit(ways((-0.1, 0.1)), state="augmented"))
+        wrong(two_ways)
 
 
 def test_a_saved_motion_warns_as_before_and_one_whose_labels_do_not_fit_is_refused(tmp_path):

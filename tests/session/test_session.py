@@ -266,13 +266,6 @@ def test_a_view_of_what_is_there_is_adopted_and_nothing_is_computed(opened, laye
     assert len(opened.engine.asked) == asked
 
 
-def test_a_view_is_no_step_of_undo_and_stays_when_others_are_taken_back(opened):
-    opened.edit("obstacle", obstacles=(at(1.0),))
-    opened.edit("ghost", view=View(ghost=False))
-    opened.session.undo()
-    assert opened.session.scenario == replace(fresh("draw_s"), view=View(ghost=False))
-
-
 @pytest.mark.parametrize("held", [False, True], ids=["a slider", "a drag, however slow"])
 def test_one_gesture_is_one_step_of_undo(opened, held):
     if held:
@@ -585,14 +578,6 @@ def test_what_the_controls_show_last_is_the_last_scenario_also_from_several_thre
     thread.join(PATIENCE)
     second.join(PATIENCE)
     assert opened.page.adopted[-1] == opened.session.scenario
-
-
-def test_a_closed_session_computes_nothing_more(opened):
-    opened.session.close()
-    asked = len(opened.engine.asked)
-    opened.edit("obstacle", obstacles=(at(1.0),))
-    assert opened.session.wait_idle(PATIENCE)
-    assert len(opened.engine.asked) == asked
 
 
 def begin_learning(opened, task="lift_box"):

@@ -412,22 +412,6 @@ async def test_a_message_that_no_page_sends_ends_its_connection(url, raw, caplog
     assert "secret" not in caplog.text + printed
 
 
-@asynchronous
-async def test_what_a_browser_keeps_is_found_again_by_the_next_page(url, server):
-    async with visiting(url) as client:
-        await client.set("Warp", 0.5)
-        await come_true(lambda: KEY in client.storage)
-        (visitor,) = server.visitors
-        made, kept = visitor.session.scenario, client.storage
-    await come_true(lambda: not server.visitors)
-    async with Client(url) as client:
-        client.storage = kept
-        await client.look()
-        assert await client.wait_for(lambda: client.has_picture, PATIENCE)
-        (visitor,) = server.visitors
-        assert visitor.session.scenario == made and made.warp == 0.5
-
-
 @pytest.mark.parametrize("text", ["{", "x" * 10**6], ids=["damaged", "too large for a message"])
 @asynchronous
 async def test_whatever_a_browser_keeps_the_page_opens_in_time_says_so_and_goes_on(url, server, text):
@@ -538,11 +522,6 @@ async def test_a_visitor_who_does_not_listen_costs_no_memory(url, server):
 # --- files ---
 
 
-def parts_held(server):
-    states = [state for visitor in server.visitors for state in uploads_of(visitor).values()]
-    return sum(len(part) for state in states for part in state["parts"].values())
-
-
 def uploads_of(visitor):
     return visitor.client.gui._current_file_upload_states
 
@@ -572,17 +551,6 @@ async def test_a_file_that_is_larger_than_announced_ends_the_connection(url):
             await client.send_file(UPLOAD, "x.stl", bytes(3 * 2**20), announced=2**20 + 1)
             assert await client.is_lost()
             await client.look()
-
-
-@asynchronous
-async def test_files_that_were_given_up_are_not_held(url, server):
-    async with visiting(url) as client:
-        for k in range(10):
-            await client.send_file(UPLOAD, "x.stl", bytes(2**20), announced=2**21, transfer=f"{k}")
-        old = {"source_component_uuid": client.find(UPLOAD), "transfer_uuid": "0"}
-        await client.send("FileTransferPart", **old, part_index=3, content=b"x")
-        assert await answers(client)
-        assert parts_held(server) == 2**20
 
 
 # --- viser ---

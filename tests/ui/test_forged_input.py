@@ -29,10 +29,9 @@ UPLOAD = viser.GuiUploadButtonHandle
 FILE = viser.UploadedFile(name="x", content=b"\0" * 100)
 NO_NUMBERS = (math.nan, math.inf, -math.inf, 1e300, -1e300)
 CLAIMS = [*NO_NUMBERS, 1e6, -9, 0, 2**70, True, None, "", "x" * 1_000_000, [], {}, FILE]
-NUMBERS = (*NO_NUMBERS, 6.0)
 PLACES = [
-    *((number, 0.1, 0.2) for number in NUMBERS),
-    *((0.1, 0.2, number) for number in NUMBERS),
+    *((number, 0.1, 0.2) for number in (math.nan, -math.inf, 1e300, 6.0)),
+    *((0.1, 0.2, number) for number in (math.inf, -1e300)),
     *((0.1, 0.2), (), None, "abc", ((1.0, 2.0, 3.0),), ("a", "b", "c")),
 ]
 TURNS = [(0.0,) * 4, (math.nan, 0.0, 0.0, 0.0), (1e300, 0.0, 0.0, 0.0), (1.0, 0.0, 0.0), None, "wxyz"]

@@ -1,14 +1,12 @@
 """What a visitor does on the page, from the browser's message to what is drawn: clicks, drags, checkboxes."""
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from pages import MIDDLE
-from scenes import avoiding, beside, biases, frame_at
+from scenes import avoiding
 
-from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.panels import BASE_PANEL
 from dt_viz.scenario.scenario import OFFERS, View
@@ -35,26 +33,6 @@ def test_a_click_on_an_obstacle_selects_it_and_shows_its_handles_and_another_hid
         assert page.session.scenario.selected == index
         assert [item.has_handles for item in items] == expected
     assert page["Handles"].value is False
-
-
-def test_delete_removes_the_selected_obstacle_and_its_handles(page):
-    before = page.busy(selected=1).obstacles
-    page.claim(page["Change"], "Delete")
-    page.done()
-    assert page.session.scenario.obstacles == (before[0], before[2])
-    items = page.visitor.pictures.markers.obstacles.items
-    np.testing.assert_allclose([item.node.position for item in items], [before[0].position, before[2].position])
-    assert sorted(name for name in page.gizmos if name.startswith("/obstacles")) == ["/obstacles/0", "/obstacles/1"]
-
-
-def test_rollouts_pass_where_the_handles_of_a_bias_point_are_dragged_to(page, engine):
-    page.begin(replace(avoiding("draw_s", (), layers=biases(BiasPoint(MIDDLE))), view=View(bias_handles=True)))
-    target = engine.task("draw_s").mean_path[50] + 0.05 * AREA.axes[:, 0]
-    page.move("/bias/0", tuple(target))
-    (layer,) = beside(page.session.scenario)
-    np.testing.assert_allclose(layer.transform.position, target)
-    for path in frame_at(engine, page.session.scenario, Stage.ROLLOUTS).rollouts:
-        assert np.linalg.norm(path - target, axis=1).min() < 0.01
 
 
 @pytest.fixture

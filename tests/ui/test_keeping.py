@@ -423,13 +423,6 @@ def test_a_task_of_large_demonstrations_leaves_what_was_kept_before(opened, monk
     assert kept(browser).scenario.task == "draw_j"
 
 
-def test_scenes_with_a_bottle_come_back_beside_the_event_loop(opened):
-    scene = SCENES["lift"].scenario(TASKS["lift_box"]())
-    page = opened(Browser(**{KEY: made(scenario=scene)}))
-    assert page.session.jobs.wait_idle(CHOICES, PATIENCE)
-    assert page.session.scenario == scene and page.session._screen.progress.restored == scene
-
-
 def test_a_link_begins_its_task_afresh_also_where_that_is_what_was_kept_and_undo_brings_it_back(opened):
     page = opened(Browser(**{KEY: made()}))
     page.visitor.told(Link("task", MADE.task))

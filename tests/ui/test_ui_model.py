@@ -60,13 +60,6 @@ def test_it_is_a_step_of_the_session_and_shown(page):
     assert page.session.scenario.arm == "" and page["Model"].value == "JACO"
 
 
-def test_one_that_cannot_be_loaded_leaves_the_old_one_on_the_page(page):
-    choose(page, "Broken")
-    assert page.session.scenario.arm == "" and page["Model"].value == "JACO"
-    said = page.session._screen.progress.message
-    assert said is not None and said.text == "broken.urdf: mesh: found nothing; accepted: a file"
-
-
 def test_joints_scenes_plots_and_the_loop_are_those_of_the_arm(page):
     visitor, scenes = page.visitor, page["Scene"].options
     assert num_joints(page) == 6 and set(scenes) >= OF_JACO

@@ -234,13 +234,9 @@ def stl(mesh):
 
 BALL_MESH = trimesh.creation.icosphere(subdivisions=3, radius=0.04)
 BAD = {
-    "long.stl": (b"\0" * (shapes.MAX_BYTES + 1), "at most 20 MB"),
     "half.stl": (stl(BALL_MESH)[:3000], "a complete .stl file"),
     "tiny.stl": (stl(BALL_MESH.copy().apply_scale(1e-6)), "a largest side of 0.01 m to 1 m"),
-    "huge.stl": (stl(BALL_MESH.copy().apply_scale(1e9)), "a largest side of 0.01 m to 1 m"),
     "what.txt": (b"?", "stl, obj, ply, glb, gltf, off, 3mf, npz, csv"),
-    "none": (b"?", "suffix: found no suffix"),
-    "few.csv": (b"x,y,z\n0,0,0\n1,1,1\n", "points: found 2; accepted: at least 50"),
 }
 
 
@@ -255,7 +251,7 @@ def test_a_bad_file_is_refused_with_what_was_found_and_the_scene_stays(opened, n
     assert opened.session.scenario == before and opened.session.steps == 0
 
 
-@pytest.mark.parametrize("suffix", ["stl", "obj", "ply", "glb", "gltf", "off", "3mf", "npz", "csv"])
+@pytest.mark.parametrize("suffix", ["stl", "csv"])
 def test_what_is_too_large_is_not_even_looked_at(opened, suffix, monkeypatch):
     monkeypatch.setattr(shapes, "read_upload", None)
     opened.files.load(b"ply\n" * (shapes.MAX_BYTES // 4 + 1), f"huge.{suffix}", 1.0)

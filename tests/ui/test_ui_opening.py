@@ -150,10 +150,7 @@ def test_a_click_learns_what_is_seen_and_undo_goes_back(opened):
     ("name", "content", "said"),
     [
         ("a.exe", b"MZ", "a.exe"),
-        ("a.npz", b"no archive", "a.npz"),
-        ("a.zip", zipped(), "a.zip"),
         ("a.csv", b"t,x,y,z\n0,0,0,0\n1,nan,0,0\n", "nan"),
-        ("a.csv", b"", "empty"),
     ],
 )
 def test_what_cannot_be_read_is_one_line_and_what_was_open_stays(opened, name, content, said):
@@ -219,8 +216,7 @@ def test_what_the_arm_cannot_reach_is_scaled_if_that_is_wanted(opened):
     assert opened["Scale to fit"].value is True
 
 
-@pytest.mark.parametrize("claim", [math.nan, -1, 2**70, None, "", "x" * 10_000, "1 · nobody", [], {}, True, 3.5])
-def test_forged_values_are_refused(opened, claim):
+def test_forged_values_are_refused(opened):
     opened.add(
         "a.zip", zipped(a=csv(timed=False, size=1000.0, jitter=0.002), b=csv(GOAL + 0.2, timed=False, size=1000.0))
     )
@@ -230,9 +226,10 @@ def test_forged_values_are_refused(opened, claim):
     for handle in shown:
         if handle.label in labels and not isinstance(handle, viser.GuiCheckboxHandle):  # viser makes booleans for those
             before = handle.value
-            opened.page.claim(handle, claim)
-            opened.done()
-            assert handle.value == before, handle.label
+            for claim in (math.nan, -1, 2**70, None, "", "x" * 10_000, "1 · nobody", [], {}, True, 3.5):
+                opened.page.claim(handle, claim)
+                opened.done()
+                assert handle.value == before, (handle.label, claim)
     hidden = [
         handle
         for handle in opened.page.inputs
