@@ -75,6 +75,17 @@ class Progress:
         return certified and not self.stale
 
 
+@dataclass
+class Edits:
+    """Edits that need frames."""
+
+    number: int = 0
+    num_skipped: int = 0
+    """Number of those that a newer one overtook."""
+    newest: float = 0.0
+    """Time of the newest, of `time.perf_counter`."""
+
+
 class Display(Protocol):
     """Receiver of a session's results: a page, or a measurement."""
 

@@ -26,7 +26,7 @@ from dt_viz.session.engine import Engine, wake
 from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.history import History
 from dt_viz.session.jobs import Jobs
-from dt_viz.session.progress import Display, Screen
+from dt_viz.session.progress import Display, Edits, Screen
 from dt_viz.warning import Severity
 
 logger = logging.getLogger(__name__)
@@ -84,12 +84,9 @@ class Session:
         """Whether the learning of the scenario was cancelled, and there is no other to go back to."""
         self._shown: Frame | None = None
         """The newest frame; None before the first one."""
-        self._num_skipped = self._num_edits = 0
-        """Edits that a newer one overtook, and all."""
+        self._edits = Edits()
         self._computed = self.scenario
         """Scenario that is computed now, or was last."""
-        self._edited = 0.0
-        """Time of the newest edit, of `time.perf_counter`."""
         self.jobs = Jobs(self.fail, account, wake)
         """All work of the visitor beside the server's event loop."""
         self._adopt()
@@ -339,10 +336,10 @@ class Session:
         engine = self.engines.get(self.scenario.arm)
         if engine is not None:
             engine.see(self.scenario)
-        self._num_edits += 1
-        self._edited = time.perf_counter()
-        work = partial(self._compute, self.scenario, self._edited)
-        self._num_skipped += self.jobs.submit(LANE, work, latest=True)
+        self._edits.number += 1
+        self._edits.newest = time.perf_counter()
+        work = partial(self._compute, self.scenario, self._edits.newest)
+        self._edits.num_skipped += self.jobs.submit(LANE, work, latest=True)
 
     def _compute(self, scenario: Scenario, edited: float) -> None:
         """Show the frames of a scenario that was wanted at a time, of `time.perf_counter`."""
@@ -395,8 +392,8 @@ class Session:
                 newest = self.scenario
                 if replace(newest, stack=before.stack, passing=before.passing) != before or newest == before:
                     return before
-                self._computed, edited = newest, self._edited
-                self._num_skipped += self.jobs.drop(LANE)
+                self._computed, edited = newest, self._edits.newest
+                self._edits.num_skipped += self.jobs.drop(LANE)
             return self._decided(newest)
 
         for frame in engine.frames(scenario, learn, superseded, newest):
@@ -404,7 +401,7 @@ class Session:
             self._shown = frame
             if frame.stage is Stage.ROLLOUTS and drawn:
                 continue  # it is only looked at in another way: the next stage is what changes
-            self._screen.draw(frame, edited, self._num_skipped, self._num_edits)
+            self._screen.draw(frame, edited, self._edits.num_skipped, self._edits.number)
             if frame.stage in (Stage.ROLLOUTS, Stage.FINE):
                 engine.drive(frame)
             if frame.stage is Stage.LIVE:

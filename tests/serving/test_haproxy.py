@@ -89,16 +89,6 @@ async def visit(url, control, servers):
         assert not first.lost
 
 
-def test_the_shipped_configuration_is_one():
-    assert HAPROXY is not None, "install it: apt-get install haproxy"
-    environment = os.environ | {"BIND": "127.0.0.1:1"}
-    said = subprocess.run(
-        [HAPROXY, "-c", "-f", str(CONFIGURATION)], env=environment, capture_output=True, text=True, check=False
-    )
-    assert said.returncode == 0, said.stderr
-
-
-@pytest.mark.slow
 def test_one_server_is_drained_and_one_is_killed(cache):
     assert HAPROXY is not None, "install it: apt-get install haproxy"
     with ExitStack() as stack:
