@@ -285,12 +285,13 @@ def test_clicks_on_save_png_are_not_done_by_the_threads_that_welcome_visitors(pa
         return np.zeros((2, 2, 4), np.uint8)
 
     monkeypatch.setattr(page.client, "get_render", render)
-    for _ in range(40):
-        page.claim(page["Save PNG"], True)
+    button = page["Save picture"]
+    for _ in range(40):  # the first begins, the others cancel
+        page.claim(button, True)
     assert page.gui._thread_executor.submit(lambda: True).result(timeout=20)
     answer.set()
-    assert page.session.jobs.wait_idle("picture", 30)
-    assert [thread.name for thread in asked] == ["picture"]
+    assert page.session.jobs.wait_idle("Save picture", 30)
+    assert [thread.name for thread in asked] == ["Save picture"]
 
 
 def test_commands_do_what_the_controls_do_each_on_a_key_of_its_own(page):
