@@ -47,6 +47,8 @@ class PictureSettings:
     """Largest width and height of the browser's window, pixels: the picture may be larger."""
     patience: float = 300.0
     """Longest time to wait for each of the page, its motion and the picture, seconds."""
+    drawing: float = 4.0
+    """Time that a browser takes for letters and surfaces once it has all that is drawn, seconds."""
     along: float = 0.45
     """Part of its motion at which the arm is shown."""
 
@@ -141,8 +143,10 @@ def _rendered(task: str, scenario: Callable[[Task], Scenario], size: tuple[int, 
     """Have a browser render a scene, its arm in the middle of its motion, as the page saves it.
 
     Raises:
-        TimeoutError: the browser does not answer.
+        FormatError: it is no browser, and ends.
+        TimeoutError: it does not answer.
     """
+    from dt_viz.errors import FormatError  # noqa: PLC0415
     from dt_viz.folders import default_cache_folder  # noqa: PLC0415
     from dt_viz.learning.store import FitStore  # noqa: PLC0415
     from dt_viz.robot.models import load_jaco  # noqa: PLC0415
@@ -153,8 +157,11 @@ def _rendered(task: str, scenario: Callable[[Task], Scenario], size: tuple[int, 
     server = Server(TASKS, FitStore(default_cache_folder()), load_jaco(), task=task, port=0)
     shrunk = min(1.0, SETTINGS.window / max(size))
     try:
-        with _opened(browser, f"http://{server.host}:{server.port}", tuple(round(shrunk * side) for side in size)):
-            _until(lambda: bool(server.visitors), f"{browser} to open the page")
+        window = tuple(round(shrunk * side) for side in size)
+        with _opened(browser, f"http://{server.host}:{server.port}", window) as process:
+            _until(lambda: bool(server.visitors) or process.poll() is not None, f"{browser} to open the page")
+            if not server.visitors:
+                raise FormatError("Chromium", f"{browser!r}, which ended", "a browser that opens a page")
             visitor = server.visitors[0]
             session = visitor.session
             session.load(task, lambda loaded: _at_rest(scenario(loaded)))
@@ -164,6 +171,10 @@ def _rendered(task: str, scenario: Callable[[Task], Scenario], size: tuple[int, 
                 raise TimeoutError(f"the page shows no motion of {task}")
             if frame.arm is not None:
                 visitor.robot.playback.live.put(frame.arm.q[round(SETTINGS.along * (len(frame.arm.q) - 1))])
+            visitor.render_alone(
+                (SETTINGS.smallest, SETTINGS.smallest), SETTINGS.patience
+            )  # all that was sent is there
+            time.sleep(SETTINGS.drawing)
             return visitor.render_alone(size, SETTINGS.patience)
     finally:
         server.close()
@@ -175,7 +186,7 @@ def _at_rest(scenario: Scenario) -> Scenario:
 
 
 @contextmanager
-def _opened(browser: str, address: str, window: tuple[int, ...]) -> Iterator[None]:
+def _opened(browser: str, address: str, window: tuple[int, ...]) -> Iterator[subprocess.Popen[bytes]]:
     """Open a page in a browser of its own, without a screen, and close it in the end."""
     sandbox = ("--no-sandbox",) if hasattr(os, "geteuid") and os.geteuid() == 0 else ()
     with tempfile.TemporaryDirectory(prefix="dt-viz-", ignore_cleanup_errors=True) as profile:
@@ -183,7 +194,7 @@ def _opened(browser: str, address: str, window: tuple[int, ...]) -> Iterator[Non
         command = (browser, "--headless", *SETTINGS.arguments, *sandbox, *own, address)
         with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
             try:
-                yield
+                yield process
             finally:
                 process.terminate()
 
@@ -192,5 +203,5 @@ def _until(condition: Callable[[], bool], what: str) -> None:
     deadline = time.monotonic() + SETTINGS.patience
     while not condition():
         if time.monotonic() > deadline:
-            raise TimeoutError(f"waited for {SETTINGS.patience:.0f} s in vain for {what}")
+            raise TimeoutError(f"waited for {SETTINGS.patience:g} s in vain for {what}")
         time.sleep(0.05)

@@ -272,7 +272,7 @@ class Visitor(Display):
             return render_png(self.client, size, self._panel.legend, transparent=transparent)
 
     def render_alone(self, size: tuple[int, int], timeout: float) -> bytes:
-        """Render the scene that is shown, as `render` does, but framed in all of the picture, with a timeout, seconds."""
+        """Render the scene that is shown as `render` does, but framed in all of the picture; `timeout` in seconds."""
         assert self.shown is not None
         framing, panels = Framing(size, panel=0.0, narrow=0), [panel.shown for panel in self.shown.pictures.panels]
         self._camera.choose(view_of(self.shown.task, framing, panels=panels))
