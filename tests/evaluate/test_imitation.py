@@ -143,7 +143,9 @@ def test_a_panel_is_drawn_from_the_broadest_side_under_its_name():
 def test_without_matplotlib_all_but_the_figures_is_written_and_one_line_says_so(lasa, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     assert main(["imitation", str(lasa / "Hook.mat"), "--out", str(tmp_path)]) == 0
-    assert capsys.readouterr().err == "no figures: matplotlib is not installed; pip install matplotlib\n"
+    assert capsys.readouterr().err == (
+        "no figures: matplotlib: found not installed; accepted: pip install 'dt-viz[figures]'\n"
+    )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["Hook.npz", "figures.json"]
 
 

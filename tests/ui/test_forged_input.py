@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import viser  # noqa: TID251 - forges what a browser sends
-from pages import CLIENT, MIDDLE, Page
+from pages import CLIENT, MIDDLE, Page, wait_until
 from viser import _messages as messages  # noqa: TID251
 
 from dt_viz.avoidance.detour import DetourSettings
@@ -286,7 +286,9 @@ def test_clicks_on_save_png_are_not_done_by_the_threads_that_welcome_visitors(pa
 
     monkeypatch.setattr(page.client, "get_render", render)
     button = page["Save picture"]
-    for _ in range(40):  # the first begins, the others cancel
+    page.claim(button, True)
+    wait_until(lambda: asked)
+    for _ in range(40):  # cancel it
         page.claim(button, True)
     assert page.gui._thread_executor.submit(lambda: True).result(timeout=20)
     answer.set()
