@@ -18,6 +18,7 @@ from types import FrameType
 from typing import TYPE_CHECKING
 
 from dt_viz.evaluate.__main__ import main as evaluate
+from dt_viz.picture import main as picture
 from dt_viz.ui.logs import RateLimitFilter
 from dt_viz.ui.origins import Origin, OriginError
 
@@ -34,19 +35,20 @@ MAX_PROCESSES, MOST_BY_DEFAULT = 64, 4
 """Largest number of processes that may be asked for, and that are taken unasked."""
 LOADED = 2.0
 """Time, seconds, within which compiled code is loaded, so that nothing is said of it."""
-MEASURE = "evaluate"
-"""Subcommand of the measurements; without it the demo starts."""
+MEASURE, PICTURE = "evaluate", "picture"
+"""Subcommands of the measurements and of pictures; without one the demo starts."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the server until Ctrl-C or SIGTERM, or a measurement (`evaluate …`); returns the process' exit status."""
+    """Run the server until Ctrl-C or SIGTERM, or a subcommand; returns the process' exit status."""
     given = sys.argv[1:] if arguments is None else arguments
     if given and given[0] == MEASURE:
         return evaluate(given[1:], prog=f"{PROG} {MEASURE}")
-    options = _parser().parse_args(given)
     try:
         with _interruptible():
-            return _serve(options)
+            if given and given[0] == PICTURE:
+                return picture(given[1:], prog=f"{PROG} {PICTURE}")
+            return _serve(_parser().parse_args(given))
     except KeyboardInterrupt:
         return 0
 
@@ -231,7 +233,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=PROG,
         description="Diffeomorphic transforms, live in the browser.",
-        epilog=f"{PROG} {MEASURE} --help: the measurements of DT-Viz",
+        epilog=f"{PROG} {MEASURE} --help: the measurements of DT-Viz; {PROG} {PICTURE} --help: pictures of scenes",
     )
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: %(default)s)")
     parser.add_argument("--port", type=_port, default=8080, help="port to listen on (default: %(default)s)")

@@ -126,7 +126,7 @@ def camera_for(task: Any, camera: Any, view: str = HOME, hand: Any = None, **fra
 def panel_of(server: viser.ViserServer, notify: Any = ignored) -> ControlPanel:
     """A panel without a page."""
     camera = CameraController(cast(Any, CameraClient()), lambda: None)
-    return ControlPanel(server.gui, TITLES, load_jaco(), {"": "JACO"}, ignored, notify, camera, ignored)
+    return ControlPanel(server.gui, TITLES, load_jaco(), {"": "JACO"}, ignored, ignored, notify, camera, ignored)
 
 
 class Kept(dict):
@@ -145,7 +145,7 @@ class Kept(dict):
 class NoFrames:
     """An engine that has no frames: nothing here is about motions."""
 
-    bring = Engine.bring
+    bring, refining = Engine.bring, Engine.refining
 
     def __init__(self, robot=None):
         self.follower = Follower(robot or load_jaco())

@@ -38,14 +38,15 @@ MAY_IMPORT: Mapping[str, set[str]] = {
     "ui": BELOW_SESSION | {"kernels", "session", "baselines", "serving"},
     "evaluate": BELOW_SESSION | {"session", "baselines"},
     "examples": {"foundation"},
-    "cli": BELOW_SESSION | {"session", "serving", "ui", "evaluate", "saving"},
+    "picture": BELOW_SESSION | {"session", "ui"},
+    "cli": BELOW_SESSION | {"session", "serving", "ui", "evaluate", "saving", "picture"},
     "__main__": {"cli"},
 }
 """The packages from the bottom up, and which of those below each may import."""
 ONLY_IMPORTERS: Mapping[str, set[str]] = {
     "pinocchio": {"robot/link_shapes.py"},
     "coal": {"robot/link_distances.py"},
-    "matplotlib": {"examples/plot.py", "evaluate/figures.py"},
+    "matplotlib": {"examples/plot.py", "pictures/figures.py"},
     "torch": {"baselines/eflow_training.py"},
     "ompl": {"baselines/mpnet_rrt.py"},
     "joblib": {"evaluate/sweep.py"},

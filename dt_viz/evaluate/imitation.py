@@ -38,8 +38,6 @@ from typing import Any
 import numpy as np
 
 from dt_viz.errors import FormatError
-from dt_viz.evaluate import figures
-from dt_viz.evaluate.figures import FigurePanel
 from dt_viz.evaluate.held_out import (
     WAYS,
     Followed,
@@ -61,6 +59,8 @@ from dt_viz.learning.imitation import OBJECTIVES, ImitationError, ImitationSetti
 from dt_viz.learning.interface import AnyImitation
 from dt_viz.learning.state import learn as learn_in_state
 from dt_viz.metrics import rms_at_equal_times
+from dt_viz.pictures import figures
+from dt_viz.pictures.figures import FigurePanel
 
 OUT = FOLDER
 STATES = ("plain", "augmented", "auto")

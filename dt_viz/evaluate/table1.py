@@ -45,7 +45,6 @@ import numpy as np
 from dt_viz.baselines.base import INSTALL, Method, NotFittedError, Plan, Planner, Problem
 from dt_viz.baselines.registry import METHODS, problem_of
 from dt_viz.errors import FormatError
-from dt_viz.evaluate import figures
 from dt_viz.evaluate.around import TURN_ARC, in_ball
 from dt_viz.evaluate.held_out import frechet
 from dt_viz.evaluate.options import (
@@ -68,6 +67,7 @@ from dt_viz.metrics import (
 )
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
+from dt_viz.pictures import figures
 from dt_viz.robot.inverse_kinematics import UnreachableError, track
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import TASKS

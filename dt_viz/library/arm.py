@@ -13,18 +13,21 @@ from numpy.typing import ArrayLike
 
 from dt_viz.control.controller import ArmController
 from dt_viz.control.settings import ControllerSettings
+from dt_viz.errors import FormatError
 from dt_viz.flows.fields import Array
 from dt_viz.flows.rotations import apart, turned
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.library.motion import NUM_COORDINATES, Motion
 from dt_viz.library.motion import Path as HandPath
-from dt_viz.motion.following import Follower
+from dt_viz.motion.following import MAX_TRACKING_ERROR, Follower
 from dt_viz.motion.solve import Solved, solve
 from dt_viz.motion.stack import FINE, LIVE
 from dt_viz.robot.inverse_kinematics import UnreachableError, best_start, inverse_kinematics, track
+from dt_viz.robot.joint_trajectory import JointTrajectory
 from dt_viz.robot.models import EndEffector, robot_from_urdf
 from dt_viz.robot.models import load_arm as load_robot
 from dt_viz.robot.placement import place
+from dt_viz.robot.rest_to_rest import rest_to_rest
 from dt_viz.robot.retiming import within_velocity_limits
 from dt_viz.robot.robot import Robot
 from dt_viz.robot.tracking_settings import TrackingSettings
@@ -45,6 +48,8 @@ class JointPath:
     """(T,) distances of the hand from the path, metres: what it misses, or gives way by."""
     turned: Array | None = None
     """(T,) angles of the hand from the path's orientations, degrees; None where it has none."""
+    gives_way: bool = False
+    """Whether the hand leaves the path to avoid something, not because it cannot follow."""
 
     def __repr__(self) -> str:
         off = in_millimetres(float(self.error.max()))
@@ -185,6 +190,25 @@ class Arm:
         times = within_velocity_limits(path.times, tracked.q, self.robot.velocity_limits)
         return JointPath(tracked.q, times, tracked.error, self._turned(tracked.q, wanted))
 
+    def trajectory(self, joints: JointPath, acceleration: float = ControllerSettings.acceleration) -> JointTrajectory:
+        """Time a motion of the joints for a controller: from rest to rest, within the arm's limits, on the same path.
+
+            arm.trajectory(joints).save("motion.yaml")  # of ROS 2; or .csv, .npz
+
+        Args:
+            joints: the motion, which is nowhere hurried.
+            acceleration: limit for each joint, rad/s²; a URDF names none.
+
+        Raises:
+            FormatError: the arm cannot follow the motion, or stands still.
+        """
+        missed, robot = float(joints.error.max()), self.robot
+        if not joints.gives_way and missed > MAX_TRACKING_ERROR:
+            found = f"one beside which the hand is up to {in_millimetres(missed)}"
+            raise FormatError("the path", found, f"paths that the arm follows to {in_millimetres(MAX_TRACKING_ERROR)}")
+        limits = (robot.lower, robot.upper), robot.velocity_limits, acceleration
+        return rest_to_rest(robot.joint_names, joints.times, joints.q, *limits)
+
     def _turned(self, q: Array, orientations: Array | None) -> Array | None:
         """Angles (T,), degrees, of the hand at postures (T, n) from orientations (T, 4)."""
         return None if orientations is None else np.rad2deg(apart(self.robot.hand_orientation(q), orientations))
@@ -227,6 +251,7 @@ class Arm:
                 within_velocity_limits(due[row], arm.p[row], limits),
                 np.linalg.norm(away[row], axis=1),
                 None if turned is None else turned[row],
+                gives_way=True,
             )
             for row in rows
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import replace
 
 import numpy as np
@@ -106,6 +107,10 @@ class Engine:
         if oldest is not None:
             del self.own[oldest]
         return task, oldest
+
+    def refining(self, cancelled: Cancelled) -> AbstractContextManager[None]:
+        """Wait for a core, and have it, as what refines has: whoever drags comes first. Raises as `Cores.slot`."""
+        return _cores.slot(cancelled)
 
     def frames(
         self,

@@ -10,6 +10,7 @@ from typing import Any
 import viser
 
 from dt_viz.avoidance.avoidance import Space
+from dt_viz.errors import FormatError
 from dt_viz.robot.placement import is_jaco
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.paper_scenes import SCENES, PaperScene, found, offered
@@ -23,14 +24,16 @@ from dt_viz.session.session import CHOICES, Session
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.controls import Control
 from dt_viz.ui.scene.camera import CameraController
+from dt_viz.ui.scene.figure import render_figure
 from dt_viz.ui.scene.legend import Legend
 from dt_viz.ui.scene.palette import Colour
 from dt_viz.ui.scripts import Link
 from dt_viz.ui.tabs.about import Command, add_about, add_commands, numbered
-from dt_viz.ui.tabs.arm import add_arm, play_or_pause
+from dt_viz.ui.tabs.arm import add_arm, add_joints, play_or_pause
 from dt_viz.ui.tabs.compare import ComparePanel
 from dt_viz.ui.tabs.opening import OpenPanel, Show
 from dt_viz.ui.tabs.picture import PictureTab, Presentation, big_type
+from dt_viz.ui.tabs.saving import Step
 from dt_viz.ui.tabs.show import ShowTab
 from dt_viz.ui.tabs.stack import StackPanel
 from dt_viz.ui.tabs.status import COLOURS, StatusLine, hint, hint_html, sentence
@@ -55,7 +58,8 @@ class ControlPanel:
         titles: Mapping[str, str],
         robot: Robot,
         arms: Mapping[str, str],
-        save_png: Callable[[str, bool], None],
+        render: Callable[[str, bool], bytes],
+        send: Callable[[str, bytes], None],
         notify: Callable[[str, Colour], None],
         tripod: CameraController,
         darken: Callable[[bool], None],
@@ -66,8 +70,8 @@ class ControlPanel:
     ) -> None:
         """Build the controls, for the titles of tasks and arms by name; they act once `connect` has given a session.
 
-        `save` sends the scenario as a file and must only submit, `open_scenario` goes on with that of a file if it
-        holds one.
+        `render` makes a picture, see `PictureTab`; `send` sends a file of a suffix and a content. `save` sends the
+        scenario as a file and must only submit, `open_scenario` goes on with that of a file if it holds one.
         """
         self._notify, self._begin_anew, self._titles = notify, (tripod.view, forget), dict(titles)
         self._notified: Message | None = None
@@ -97,10 +101,11 @@ class ControlPanel:
             self.show = ShowTab(gui, bindings)
         with tabs.add_tab("Arm"):
             add_arm(gui, bindings, arms, self.begin)
+            add_joints(gui, bindings, send)
         with tabs.add_tab("Compare"):
             self._compare = ComparePanel(gui, bindings)
         with tabs.add_tab("Picture"):
-            act = {"darken": darken, "enlarge": enlarge, "save_png": save_png}
+            act = {"darken": darken, "enlarge": enlarge, "render": render, "draw": self._draw, "send": send}
             picture = PictureTab(gui, bindings, tripod, self.presentation, **act)
         commands = self._commands(gui.main_panel, picture, save)
         add_commands(gui, bindings, commands)
@@ -234,6 +239,13 @@ class ControlPanel:
 
         session.expect(True)
         session.jobs.submit(CHOICES, work, latest=True)
+
+    def _draw(self, suffix: str, step: Step) -> bytes:
+        """Draw the frame that is shown as a figure; raises FormatError where there is none yet."""
+        frame = self.bindings.frame
+        if frame is None:
+            raise FormatError("the scene", "nothing yet", "a scene that is shown")
+        return render_figure(frame, suffix, step)
 
     def _commands(
         self,

@@ -22,7 +22,7 @@ from dt_viz.scenario.relocation import in_world
 from dt_viz.scenario.saved import Known, Saved, encode, is_saved
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import with_avoidance
-from dt_viz.scenario.tasks import TASKS
+from dt_viz.scenario.tasks import TASKS, Task
 from dt_viz.serving.board import Share
 from dt_viz.session.arms import ArmStore
 from dt_viz.session.comparison import OTHERS
@@ -36,7 +36,7 @@ from dt_viz.ui.counting import Counted
 from dt_viz.ui.keeping import Keeper
 from dt_viz.ui.panel import ControlPanel
 from dt_viz.ui.playback import Playback
-from dt_viz.ui.scene.camera import CameraController
+from dt_viz.ui.scene.camera import CameraController, Framing, view_of
 from dt_viz.ui.scene.export import RESOLUTIONS, render_png
 from dt_viz.ui.scene.palette import DARK, LIGHT, Colour, Theme
 from dt_viz.ui.scene.robot_scene import RobotScene
@@ -47,7 +47,12 @@ from dt_viz.warning import Severity
 
 def initial_scenario(engine: Engine, name: str) -> Scenario:
     """Return the scenario that a task begins with. Raises what `Engine.task` raises."""
-    scenario, task = Scenario(name), engine.task(name)
+    return initial(engine.task(name))
+
+
+def initial(task: Task) -> Scenario:
+    """Return the scenario that a task begins with."""
+    scenario = Scenario(task.name)
     if task.layers:
         return replace(scenario, stack=in_world(task))
     sphere = Sphere(task.obstacle_position, task.size * Sphere.diameter)
@@ -103,7 +108,8 @@ class Visitor(Display):
             titles,
             robot,
             titled,
-            self._save_png,
+            lambda resolution, transparent: self.render(RESOLUTIONS[resolution], transparent=transparent),
+            self._send,
             partial(notify, client),
             self._camera,
             self._darken,
@@ -187,7 +193,7 @@ class Visitor(Display):
             except DataError as error:
                 session.say(str(error), Severity.ALARM)
             else:
-                self.client.send_file_download(f"{self._name}.json", content, save_immediately=True)
+                self._send(".json", content)
 
         session.jobs.submit(EDITS, send)
 
@@ -260,10 +266,23 @@ class Visitor(Display):
         finally:
             self._paint(self._theme)
 
-    def _save_png(self, resolution: str, transparent: bool) -> None:
+    def render(self, size: tuple[int, int], *, transparent: bool = False) -> bytes:
+        """Render the scene as the visitor sees it, as a PNG of a width and height in pixels; see `render_png`."""
         with self.pictures.without_handles(), self.robot.grip.hidden(), self._light():
-            content = render_png(self.client, RESOLUTIONS[resolution], self._panel.legend, transparent=transparent)
-        self.client.send_file_download(f"{self._name}.png", content, save_immediately=True)
+            return render_png(self.client, size, self._panel.legend, transparent=transparent)
+
+    def render_alone(self, size: tuple[int, int], timeout: float) -> bytes:
+        """Render the scene that is shown as `render` does, but framed in all of the picture; `timeout` in seconds."""
+        assert self.shown is not None
+        framing, panels = Framing(size, panel=0.0, narrow=0), [panel.shown for panel in self.shown.pictures.panels]
+        self._camera.choose(view_of(self.shown.task, framing, panels=panels))
+        self.robot.playback.advance(0.0)
+        self.client.flush()
+        with self.pictures.without_handles(), self.robot.grip.hidden(), self._light():
+            return render_png(self.client, size, self._panel.legend, transparent=False, timeout=timeout)
+
+    def _send(self, suffix: str, content: bytes) -> None:
+        self.client.send_file_download(f"{self._name}{suffix}", content, save_immediately=True)
 
     @property
     def _name(self) -> str:

@@ -242,7 +242,7 @@ def test_the_saved_png_has_the_chosen_size_and_is_not_blank(visit):
     assert visitor.session.wait_idle(PATIENCE)
     open_tab(page, "Picture")
     with page.expect_download() as download:
-        press(page.get_by_text("Save PNG"))
+        press(page.get_by_text("Save picture"))
     image = Image.open(io.BytesIO(download.value.path().read_bytes()))
     assert image.size == (1280, 720)
     assert image.mode == "RGB"

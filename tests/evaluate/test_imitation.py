@@ -12,15 +12,16 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 from turning import turning_takes
 
-from dt_viz.evaluate import figures, imitation
+from dt_viz.evaluate import imitation
 from dt_viz.evaluate.__main__ import main
-from dt_viz.evaluate.figures import FigurePanel
 from dt_viz.evaluate.held_out import WAYS, degrees_off, follow
 from dt_viz.flows.rotations import quaternions, rotation
 from dt_viz.learning.augmented import fit_augmented
 from dt_viz.learning.demonstrations import Demonstration, save_demonstrations
 from dt_viz.learning.imitation import fit, grown_grid
 from dt_viz.metrics import resample_by_arc_length, rms_at_equal_times
+from dt_viz.pictures import figures
+from dt_viz.pictures.figures import FigurePanel
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +143,9 @@ def test_a_panel_is_drawn_from_the_broadest_side_under_its_name():
 def test_without_matplotlib_all_but_the_figures_is_written_and_one_line_says_so(lasa, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     assert main(["imitation", str(lasa / "Hook.mat"), "--out", str(tmp_path)]) == 0
-    assert capsys.readouterr().err == "no figures: matplotlib is not installed; pip install matplotlib\n"
+    assert capsys.readouterr().err == (
+        "no figures: matplotlib: found not installed; accepted: pip install 'dt-viz[figures]'\n"
+    )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["Hook.npz", "figures.json"]
 
 

@@ -8,11 +8,12 @@ import pytest
 from dt_viz.baselines.base import Plan
 from dt_viz.baselines.registry import problem_of
 from dt_viz.errors import FormatError, never
-from dt_viz.evaluate import figures, table1
+from dt_viz.evaluate import table1
 from dt_viz.evaluate.__main__ import main
 from dt_viz.metrics import discrete_frechet, resample_by_arc_length
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.obstacles.union import Union
+from dt_viz.pictures import figures
 from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import TASKS

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import viser  # noqa: TID251 - forges what a browser sends
-from pages import CLIENT, MIDDLE, Page
+from pages import CLIENT, MIDDLE, Page, wait_until
 from viser import _messages as messages  # noqa: TID251
 
 from dt_viz.avoidance.detour import DetourSettings
@@ -284,12 +284,15 @@ def test_clicks_on_save_png_are_not_done_by_the_threads_that_welcome_visitors(pa
         return np.zeros((2, 2, 4), np.uint8)
 
     monkeypatch.setattr(page.client, "get_render", render)
-    for _ in range(40):
-        page.claim(page["Save PNG"], True)
+    button = page["Save picture"]
+    page.claim(button, True)
+    wait_until(lambda: asked)
+    for _ in range(40):  # cancel it
+        page.claim(button, True)
     assert page.gui._thread_executor.submit(lambda: True).result(timeout=20)
     answer.set()
-    assert page.session.jobs.wait_idle("picture", 30)
-    assert [thread.name for thread in asked] == ["picture"]
+    assert page.session.jobs.wait_idle("Save picture", 30)
+    assert [thread.name for thread in asked] == ["Save picture"]
 
 
 def test_commands_do_what_the_controls_do_each_on_a_key_of_its_own(page):

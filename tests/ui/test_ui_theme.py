@@ -79,6 +79,6 @@ def test_a_picture_is_saved_in_light_colours_and_the_dark_theme_stays(page, monk
         return np.zeros((2, 2, 4), np.uint8)
 
     monkeypatch.setattr(page.client, "get_render", render)
-    page.visitor._save_png("1280 × 720", transparent=False)
+    page.visitor.render((1280, 720))
     assert taken[0] == light and colours(page) == dark != light
     choose(page, False)

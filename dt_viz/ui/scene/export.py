@@ -21,7 +21,14 @@ TIMEOUT = 60.0
 """Longest time to wait for the browser, seconds."""
 
 
-def render_png(client: viser.ClientHandle, size: tuple[int, int], legend: Legend | None, *, transparent: bool) -> bytes:
+def render_png(
+    client: viser.ClientHandle,
+    size: tuple[int, int],
+    legend: Legend | None,
+    *,
+    transparent: bool,
+    timeout: float = TIMEOUT,
+) -> bytes:
     """Render the visitor's view as a PNG file.
 
     Args:
@@ -29,12 +36,13 @@ def render_png(client: viser.ClientHandle, size: tuple[int, int], legend: Legend
         size: width and height, pixels.
         legend: legend of its colours, drawn onto it.
         transparent: keep the background transparent, else make it white.
+        timeout: longest time to wait for the browser, seconds.
 
     Raises:
         TimeoutError: the browser did not answer.
     """
     width, height = size
-    rgba = client.get_render(height, width, transport_format="png", timeout=TIMEOUT)
+    rgba = client.get_render(height, width, transport_format="png", timeout=timeout)
     return as_png(Image.fromarray(np.asarray(rgba), "RGBA"), legend, transparent=transparent)
 
 

@@ -9,16 +9,25 @@ from functools import partial
 import numpy as np
 import viser
 
+from dt_viz.control.settings import ControllerSettings
+from dt_viz.errors import Cancelled, FormatError
+from dt_viz.robot.joint_trajectory import FORMATS
+from dt_viz.robot.rest_to_rest import rest_to_rest
 from dt_viz.scenario.roaming import Chase, MovingGoal
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.session.frame import Stage
 from dt_viz.session.player import Play
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import KEEP, Bindings
+from dt_viz.ui.controls import Control
+from dt_viz.ui.tabs.saving import SaveButton, Step
+from dt_viz.warning import Kind
 
 OBSTACLE_SPEEDS: Mapping[str, float] = {"Obstacle": 0.08, "Fast obstacle": 0.25}
 """Speeds of the obstacle that crosses the motion, by their names on the page, m/s."""
 GOAL = "Goal"
+JOINT_FORMATS: Mapping[str, str] = {"ROS 2 YAML": ".yaml", "CSV": ".csv", "npz": ".npz"}
+"""Suffixes of files of the joints, by their names on the page."""
 
 
 def add_arm(gui: viser.GuiApi, bindings: Bindings, arms: Mapping[str, str], begin: Callable[..., None]) -> None:
@@ -68,6 +77,30 @@ def add_arm(gui: viser.GuiApi, bindings: Bindings, arms: Mapping[str, str], begi
         lambda _s, value: {"arm_rollout": int(value) - 1},
         max=num_rollouts,
     )
+
+
+def add_joints(gui: viser.GuiApi, bindings: Bindings, send: Callable[[str, bytes], None]) -> None:
+    """Build what saves the motion of the joints where the panel is being built; `send` gets a suffix and a content."""
+    hint = "the arm's motion for a robot of yours, from rest to rest within its limits: for ROS 2, or as a table"
+    chosen = Control(gui.add_dropdown("Joints as", tuple(JOINT_FORMATS), hint=hint))
+
+    def make(session: Session, step: Step, cancelled: Cancelled) -> tuple[str, bytes]:
+        frame, robot = bindings.frame, session.robot
+        if frame is None or frame.arm is None or frame.blocked:
+            found = frame.blocked[0].text if frame is not None and frame.blocked else "none that is shown"
+            raise FormatError("the arm's motion", found, "one that the arm follows, with “Arm” on in the tab “Show”")
+        missed = [warning.text for warning in frame.certificates.warnings if warning.kind is Kind.PATH_MISSED]
+        if missed:
+            raise FormatError("the arm's motion", missed[0], "one that the arm follows")
+        limits = (robot.lower, robot.upper), robot.velocity_limits, ControllerSettings.acceleration
+        with session.engine.refining(cancelled):
+            trajectory = rest_to_rest(robot.joint_names, frame.arm.times, frame.arm.q, *limits)
+        step(0.5)
+        suffix = JOINT_FORMATS[chosen.value]
+        return suffix, FORMATS[suffix](trajectory)
+
+    hint = "of the rollout that the arm follows, as “Replay” shows it; press again to cancel"
+    SaveButton(gui, bindings, "Save joints", make, send, icon=viser.Icon.DOWNLOAD, hint=hint)
 
 
 def play_or_pause(session: Session, _pressed: bool = True) -> None:

@@ -8,17 +8,20 @@ from functools import partial
 
 import viser
 
+from dt_viz.errors import Cancelled
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.controls import Control, on_press, switch
 from dt_viz.ui.scene.camera import HAND, HOME, VIEWS, CameraController, Framing
 from dt_viz.ui.scene.export import RESOLUTIONS
+from dt_viz.ui.scene.figure import SUFFIXES
 from dt_viz.ui.tabs.about import Command
+from dt_viz.ui.tabs.saving import SaveButton, Step
 
 LARGER = 1.4
 """Factor by which the panel, its type and its controls are larger for a projector."""
-LANE = "picture"
-"""Lane of the session's jobs on which one picture is made: a browser may take a minute to render, or never answer."""
+PNG = "PNG"
+"""Name of the format that a browser renders; others are drawn here, as lines and text."""
 ROW = (
     "<style>div:has(> .dt-row) + div > div > :first-child { width: auto !important; }</style><div class='dt-row'></div>"
 )
@@ -53,9 +56,14 @@ class PictureTab:
         *,
         darken: Callable[[bool], None],
         enlarge: Callable[[bool], None],
-        save_png: Callable[[str, bool], None],
+        render: Callable[[str, bool], bytes],
+        draw: Callable[[str, Step], bytes],
+        send: Callable[[str, bytes], None],
     ) -> None:
-        """Build the controls where the panel is being built; `save_png` takes a resolution, and whether transparent."""
+        """Build the controls where the panel is being built.
+
+        `render` makes a PNG, of a resolution, and perhaps transparent, `draw` a file of lines with a suffix.
+        """
         self._tripod = tripod
         gui.add_html(ROW)
         Control(gui.add_button_group("View", (*VIEWS, HAND, HOME)), tripod.view)
@@ -72,10 +80,21 @@ class PictureTab:
         big = box("Big type", "larger type and controls in a wider panel, to be read from afar")
         self._big = Control(big, enlarge)
         on_press(gui.add_button("Presentation", icon=viser.Icon.PRESENTATION), lambda: presentation.show(True))
+        formats = PNG, *(suffix[1:].upper() for suffix in SUFFIXES)
+        hint = "PNG: the scene as you see it; SVG, PDF: lines and text for a paper, seen from the plane of the task"
+        self._format = Control(gui.add_dropdown("Format", formats, hint=hint), self._choose)
         self._resolution = Control(gui.add_dropdown("Resolution", tuple(RESOLUTIONS)))
         self._transparent = Control(gui.add_checkbox("Transparent", False))
-        self._save, self._save_png = gui.add_button("Save PNG", icon=viser.Icon.CAMERA), save_png
-        bindings.on(self._save, self._request)
+
+        def make(session: Session, step: Step, cancelled: Cancelled) -> tuple[str, bytes]:
+            if self._format.value == PNG:
+                return ".png", render(self._resolution.value, self._transparent.value)
+            suffix = f".{self._format.value.lower()}"
+            with session.engine.refining(cancelled):
+                return suffix, draw(suffix, step)
+
+        hint = "of the scene, as a file; press again to cancel"
+        SaveButton(gui, bindings, "Save picture", make, send, icon=viser.Icon.CAMERA, hint=hint)
 
     @property
     def commands(self) -> list[Command]:
@@ -90,17 +109,10 @@ class PictureTab:
             Command("Big type for a projector, or the usual one", lambda _: switch(self._big), "B"),
         ]
 
-    def _request(self, session: Session, _pressed: bool) -> None:
-        """Begin a picture unless one is being made."""
-        if not session.jobs.busy(LANE):
-            session.jobs.submit(LANE, partial(self._make, self._resolution.value, self._transparent.value))
-
-    def _make(self, resolution: str, transparent: bool) -> None:
-        self._save.disabled = True
-        try:
-            self._save_png(resolution, transparent)
-        finally:
-            self._save.disabled = False
+    def _choose(self, chosen: str) -> None:
+        """Show what there is to choose of a format."""
+        for control in (self._resolution, self._transparent):
+            control.handle.visible = chosen == PNG
 
 
 def big_type(gui: viser.GuiApi, tripod: CameraController) -> Callable[[bool], None]:

@@ -1,0 +1,207 @@
+"""A picture of a scene without a page: a PNG by an installed Chromium, an SVG or a PDF by matplotlib.
+
+dt-viz picture fig-4 --out fig4.png --size 3840x2160
+dt-viz picture draw_s --out s.svg
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from dt_viz.scenario.scenario import Scenario
+    from dt_viz.scenario.tasks import Task
+
+BAD_INPUT = 2
+"""Exit status for what the user can put right; argparse uses the same."""
+
+
+@dataclass(frozen=True)
+class PictureSettings:
+    """What pictures may be, and how a browser makes them."""
+
+    browsers: tuple[str, ...] = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+    """Commands that are looked for, the first that there is is taken."""
+    arguments: tuple[str, ...] = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--mute-audio")
+    """Arguments with which a browser draws by software, without a screen."""
+    variable: str = "DT_VIZ_CHROMIUM"
+    """Name of the environment variable that names another browser."""
+    smallest: int = 64
+    """Smallest width and height, pixels."""
+    largest: int = 7680
+    """Largest width and height, pixels."""
+    window: int = 1920
+    """Largest width and height of the browser's window, pixels: the picture may be larger."""
+    patience: float = 300.0
+    """Longest time to wait for each of the page, its motion and the picture, seconds."""
+    drawing: float = 4.0
+    """Time that a browser takes for letters and surfaces once it has all that is drawn, seconds."""
+    along: float = 0.45
+    """Part of its motion at which the arm is shown."""
+
+
+SETTINGS = PictureSettings()
+
+
+def main(arguments: Sequence[str], prog: str) -> int:
+    """Make a picture; returns the process' exit status, or raises SystemExit where argparse does."""
+    parser = argparse.ArgumentParser(prog=prog, description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("scene", metavar="SCENE", help="a scene, such as fig-4 or its name, or a task")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="a .png, .svg or .pdf")
+    parser.add_argument("--size", default="1920x1080", metavar="WxH", help="pixels of a PNG (default: %(default)s)")
+    options = parser.parse_args(arguments)
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # numerical libraries read these when they are first imported
+    from dt_viz.errors import DataError, FormatError  # noqa: PLC0415
+    from dt_viz.files.npz import write_whole  # noqa: PLC0415
+    from dt_viz.learning.imitation import ImitationError  # noqa: PLC0415
+
+    logging.basicConfig(level=logging.CRITICAL)  # what a browser that is closed leaves unsaid is no matter
+    try:
+        make = _maker(options.out, options.size)
+        task, scenario = _chosen(options.scene)
+        write_whole(options.out, make(task, scenario))
+    except (DataError, FormatError, ImitationError, OSError, TimeoutError) as error:
+        print(f"{prog}: {error}", file=sys.stderr)
+        return BAD_INPUT
+    print(options.out)
+    return 0
+
+
+def _maker(out: Path, size: str) -> Callable[[str, Callable[[Task], Scenario]], bytes]:
+    """Return what makes a file of this kind; raises FormatError before anything is computed where nothing can."""
+    from dt_viz.errors import FormatError  # noqa: PLC0415
+    from dt_viz.pictures.figures import check_installed  # noqa: PLC0415
+    from dt_viz.ui.scene.figure import SUFFIXES  # noqa: PLC0415
+
+    if out.suffix not in (".png", *SUFFIXES):
+        raise FormatError("--out", repr(str(out)), f"a file that ends in {', '.join(('.png', *SUFFIXES))}")
+    if not out.absolute().parent.is_dir() or out.is_dir():
+        raise FormatError("--out", repr(str(out)), "a file in a folder that exists")
+    if out.suffix in SUFFIXES:
+        check_installed()
+        return lambda task, scenario: _drawn(task, scenario, out.suffix)
+    found = re.fullmatch(r"(\d{1,9})x(\d{1,9})", size)
+    pixels = tuple(int(number) for number in found.groups()) if found else (0, 0)
+    if not SETTINGS.smallest <= min(pixels) <= max(pixels) <= SETTINGS.largest:
+        accepted = f"WIDTHxHEIGHT, each {SETTINGS.smallest} to {SETTINGS.largest}"
+        raise FormatError("--size", repr(size), accepted)
+    given = os.environ.get(SETTINGS.variable)
+    browser = next(filter(None, map(shutil.which, (given,) if given else SETTINGS.browsers)), None)
+    if browser is None:
+        accepted = f"one of {', '.join(SETTINGS.browsers)}, or its path in {SETTINGS.variable} (or --out with .svg)"
+        raise FormatError("Chromium", repr(given) if given else "none installed", accepted)
+    return lambda task, scenario: _rendered(task, scenario, (pixels[0], pixels[1]), browser)
+
+
+def _chosen(name: str) -> tuple[str, Callable[[Task], Scenario]]:
+    """Return the task, and what makes the scenario, of a scene or a task; raises FormatError if there is neither."""
+    from dt_viz.errors import FormatError  # noqa: PLC0415
+    from dt_viz.scenario.paper_scenes import found, offered  # noqa: PLC0415
+    from dt_viz.scenario.tasks import TASKS  # noqa: PLC0415
+    from dt_viz.ui.visitor import initial  # noqa: PLC0415
+
+    scenes = offered(TASKS)
+    scene = found(name, scenes) if name else None
+    if scene is not None:
+        return scene.task, scene.scenario
+    if name not in TASKS:
+        raise FormatError("SCENE", repr(name), ", ".join((*(each.name for each in scenes), *TASKS)))
+    return name, initial
+
+
+def _drawn(task: str, scenario: Callable[[Task], Scenario], suffix: str) -> bytes:
+    """Draw a scene as lines and text."""
+    from dt_viz.folders import default_cache_folder  # noqa: PLC0415
+    from dt_viz.learning.store import FitStore  # noqa: PLC0415
+    from dt_viz.robot.models import load_jaco  # noqa: PLC0415
+    from dt_viz.scenario.tasks import TASKS  # noqa: PLC0415
+    from dt_viz.session.engine import Engine  # noqa: PLC0415
+    from dt_viz.session.frame import Stage  # noqa: PLC0415
+    from dt_viz.ui.scene.figure import render_figure  # noqa: PLC0415
+
+    engine = Engine(TASKS, FitStore(default_cache_folder()), load_jaco())
+    frames = engine.frames(scenario(engine.task(task)))
+    return render_figure(next(frame for frame in frames if frame.stage is Stage.FINE), suffix)
+
+
+def _rendered(task: str, scenario: Callable[[Task], Scenario], size: tuple[int, int], browser: str) -> bytes:
+    """Have a browser render a scene, its arm in the middle of its motion, as the page saves it.
+
+    Raises:
+        FormatError: it is no browser, and ends.
+        TimeoutError: it does not answer.
+    """
+    from dt_viz.errors import FormatError  # noqa: PLC0415
+    from dt_viz.folders import default_cache_folder  # noqa: PLC0415
+    from dt_viz.learning.store import FitStore  # noqa: PLC0415
+    from dt_viz.robot.models import load_jaco  # noqa: PLC0415
+    from dt_viz.scenario.tasks import TASKS  # noqa: PLC0415
+    from dt_viz.session.frame import Stage  # noqa: PLC0415
+    from dt_viz.ui.server import Server  # noqa: PLC0415
+
+    server = Server(TASKS, FitStore(default_cache_folder()), load_jaco(), task=task, port=0)
+    shrunk = min(1.0, SETTINGS.window / max(size))
+    try:
+        window = tuple(round(shrunk * side) for side in size)
+        with _opened(browser, f"http://{server.host}:{server.port}", window) as process:
+            _until(lambda: bool(server.visitors) or process.poll() is not None, f"{browser} to open the page")
+            if not server.visitors:
+                raise FormatError("Chromium", f"{browser!r}, which ended", "a browser that opens a page")
+            visitor = server.visitors[0]
+            session = visitor.session
+            session.load(task, lambda loaded: _at_rest(scenario(loaded)))
+            _until(lambda: session.wait_idle(0.1), "the motion")
+            frame = visitor.shown
+            if frame is None or frame.stage is not Stage.CERTIFIED:
+                raise TimeoutError(f"the page shows no motion of {task}")
+            if frame.arm is not None:
+                visitor.robot.playback.live.put(frame.arm.q[round(SETTINGS.along * (len(frame.arm.q) - 1))])
+            visitor.render_alone(
+                (SETTINGS.smallest, SETTINGS.smallest), SETTINGS.patience
+            )  # all that was sent is there
+            time.sleep(SETTINGS.drawing)
+            return visitor.render_alone(size, SETTINGS.patience)
+    finally:
+        server.close()
+
+
+def _at_rest(scenario: Scenario) -> Scenario:
+    """The scenario, its arm where it is put."""
+    return replace(scenario, view=replace(scenario.view, playing=False))
+
+
+@contextmanager
+def _opened(browser: str, address: str, window: tuple[int, ...]) -> Iterator[subprocess.Popen[bytes]]:
+    """Open a page in a browser of its own, without a screen, and close it in the end."""
+    sandbox = ("--no-sandbox",) if hasattr(os, "geteuid") and os.geteuid() == 0 else ()
+    with tempfile.TemporaryDirectory(prefix="dt-viz-", ignore_cleanup_errors=True) as profile:
+        own = (f"--user-data-dir={profile}", "--remote-debugging-port=0", f"--window-size={window[0]},{window[1]}")
+        command = (browser, "--headless", *SETTINGS.arguments, *sandbox, *own, address)
+        with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+            try:
+                yield process
+            finally:
+                process.terminate()
+
+
+def _until(condition: Callable[[], bool], what: str) -> None:
+    deadline = time.monotonic() + SETTINGS.patience
+    while not condition():
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"waited for {SETTINGS.patience:g} s in vain for {what}")
+        time.sleep(0.05)

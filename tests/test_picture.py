@@ -1,0 +1,81 @@
+"""Pictures of scenes by the command line."""
+
+import shutil
+import tempfile
+
+import numpy as np
+import pytest
+from chromium import needs_chromium
+from PIL import Image
+
+from dt_viz.cli import main
+from dt_viz.picture import SETTINGS
+
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of matplotlib's own parts
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (("nowhere", "--out", "f.png"), "SCENE: found 'nowhere'; accepted: lift, push, "),
+        (("", "--out", "f.svg"), "SCENE: found ''; accepted: lift, push, "),
+        (("draw_s", "--out", "f.png", "--size", "0x0"), "--size: found '0x0'; accepted: WIDTHxHEIGHT, each 64 to 7680"),
+        (("draw_s", "--out", "f.png", "--size", "1920x100000"), "--size: found '1920x100000'; accepted"),
+        (("draw_s", "--out", "f.png", "--size", "large"), "--size: found 'large'; accepted"),
+        (
+            ("draw_s", "--out", "nowhere/f.png"),
+            "--out: found 'nowhere/f.png'; accepted: a file in a folder that exists",
+        ),
+        (("draw_s", "--out", "f.gif"), "--out: found 'f.gif'; accepted: a file that ends in .png, .svg, .pdf"),
+        (("draw_s", "--out", "."), "--out: found '.'; accepted: a file that ends in"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line(given, said, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv(SETTINGS.variable, "true")  # a command that there is
+    assert main(["picture", *given]) == 2
+    out, error = capsys.readouterr()
+    assert not out and error.startswith(f"dt-viz picture: {said}") and error.count("\n") == 1
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_png_needs_a_browser_and_says_so(capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv(SETTINGS.variable, str(tmp_path / "no-browser"))
+    assert main(["picture", "draw_s", "--out", str(tmp_path / "f.png")]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("dt-viz picture: Chromium: found ") and "or its path in DT_VIZ_CHROMIUM" in error
+
+
+@pytest.mark.parametrize(("does", "said"), [("exit", "which ended"), ("exec sleep 60", "waited for 0.5 s in vain for")])
+def test_a_browser_that_opens_nothing_is_given_up(does, said, capsys, tmp_path, monkeypatch):
+    browser = tmp_path / "browser"
+    browser.write_text(f"#!/bin/sh\n{does}\n")
+    browser.chmod(0o755)
+    monkeypatch.setenv(SETTINGS.variable, str(browser))
+    monkeypatch.setattr("dt_viz.picture.SETTINGS", type(SETTINGS)(patience=0.5))
+    assert main(["picture", "draw_s", "--out", str(tmp_path / "f.png")]) == 2
+    assert said in capsys.readouterr().err
+    assert [*tmp_path.iterdir()] == [browser]
+
+
+def test_a_scene_is_drawn_as_lines_and_text(tmp_path, cache, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
+    assert main(["picture", "fig-2", "--out", str(tmp_path / "f.svg")]) == 0
+    svg = (tmp_path / "f.svg").read_text()
+    assert all(f">{title}</text>" in svg for title in ("base attractor", "imitation", "+ avoidance", "rollouts"))
+
+
+@needs_chromium
+@pytest.mark.browser
+def test_a_scene_is_rendered_in_any_size_and_seen_whole(tmp_path, cache, monkeypatch, request):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
+    own = tempfile.mkdtemp(dir="/tmp")  # Chromium needs a short path there, and leaves files behind
+    monkeypatch.setenv("TMPDIR", own)
+    request.addfinalizer(lambda: shutil.rmtree(own, ignore_errors=True))
+    assert main(["picture", "steps", "--out", str(tmp_path / "f.png"), "--size", "1000x500"]) == 0
+    image = np.asarray(Image.open(tmp_path / "f.png")).astype(int)
+    assert image.shape == (500, 1000, 3)
+    rows, columns = np.nonzero(np.abs(image - (213, 94, 0)).max(axis=2) < 60)  # the rollouts of three panels
+    assert len(rows) > 300
+    assert (np.histogram(columns, bins=3, range=(0, 1000))[0] > 50).all()
+    assert columns.min() > 50 and columns.max() < 950

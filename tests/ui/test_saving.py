@@ -1,0 +1,172 @@
+"""What a visitor takes home: files of the joints and figures, made beside the server's event loop, or one line why."""
+
+import io
+import re
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+from pages import Page, wait_until
+from PIL import Image
+
+from dt_viz.control.settings import ControllerSettings
+from dt_viz.session.frame import Stage
+from dt_viz.ui.scene.figure import SUFFIXES, render_figure
+from dt_viz.warning import ARM, Kind, MotionWarning
+
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of matplotlib's own parts
+
+
+@pytest.fixture(scope="module")
+def saving(server, robot):
+    """A page that keeps what it sends to its visitor."""
+    page = Page(server, robot)
+    sent: list = []
+    page.client.send_file_download = lambda name, content, **_how: sent.append((name, content))
+    page.sent = sent  # type: ignore[attr-defined]
+    yield page
+    page.close()
+
+
+@pytest.fixture
+def frame(at_rest, initial):
+    return at_rest(initial("draw_s"), Stage.FINE)
+
+
+def press(page, label):
+    """Press a button, and return what the visitor is sent and told."""
+    page.sent.clear()
+    page.claim(page[label], True)
+    assert page.session.jobs.wait_idle(label, 60)
+    message = page.session._screen.progress.message
+    return list(page.sent), "" if message is None else message.text
+
+
+def shown(page, frame):
+    page.visitor._panel.bindings.report(frame)
+    page.visitor.shown = frame
+
+
+def test_the_joints_are_saved_in_each_format_as_the_frame_has_them(saving, frame, robot):
+    shown(saving, frame)
+    for chosen, suffix in (("ROS 2 YAML", ".yaml"), ("CSV", ".csv"), ("npz", ".npz")):
+        saving.claim(saving["Joints as"], chosen)
+        ((name, content),), _ = press(saving, "Save joints")
+        assert name == f"dt-viz-draw_s{suffix}"
+        if suffix == ".yaml":
+            points = yaml.safe_load(content)["points"]
+            ends = np.array([points[k]["positions"] for k in (0, -1)])
+            accelerations = np.abs([point["accelerations"] for point in points])
+        elif suffix == ".csv":
+            table = np.loadtxt(io.BytesIO(content), delimiter=",", skiprows=1)
+            ends, accelerations = table[[0, -1], 1:7], np.abs(table[:, 13:])
+        else:
+            arrays = np.load(io.BytesIO(content))
+            ends, accelerations = arrays["positions"][[0, -1]], np.abs(arrays["accelerations"])
+        np.testing.assert_allclose(ends, frame.arm.q[[0, -1]], atol=1e-8)
+        assert 0.1 < accelerations.max() <= ControllerSettings.acceleration
+
+
+@pytest.mark.parametrize("why", ["none shown", "blocked", "missed"])
+def test_a_motion_that_the_arm_does_not_follow_has_no_file_and_one_line_says_why(saving, frame, why):
+    text = "the arm misses the path of rollout 1 by up to 31 mm"
+    missed = MotionWarning(Kind.PATH_MISSED, text, ARM)
+    without = {
+        "none shown": replace(frame, arm=None),
+        "blocked": replace(frame, blocked=(MotionWarning(Kind.ARM_BLOCKED, "the goal is inside", ARM),)),
+        "missed": replace(frame, certificates=frame.certificates.warning(missed)),
+    }
+    shown(saving, without[why])
+    sent, said = press(saving, "Save joints")
+    assert not sent and "\n" not in said
+    assert {"none shown": "none that is shown", "blocked": "the goal is inside", "missed": text}[why] in said
+
+
+def test_a_figure_is_saved_of_what_is_shown(saving, frame):
+    shown(saving, frame)
+    assert saving["Resolution"].visible
+    for suffix in SUFFIXES:
+        saving.claim(saving["Format"], suffix[1:].upper())
+        assert not [handle for handle in saving.inputs if handle.label == "Resolution" and handle.visible]
+        ((name, content),), _ = press(saving, "Save picture")
+        assert name == f"dt-viz-draw_s{suffix}"
+        assert content.startswith({".svg": b"<?xml", ".pdf": b"%PDF"}[suffix])
+    saving.claim(saving["Format"], "PNG")
+    assert saving["Resolution"].visible
+    ((name, content),), _ = press(saving, "Save picture")
+    assert name.endswith(".png") and Image.open(io.BytesIO(content)).size == (2, 2)
+
+
+def test_a_second_press_cancels_and_the_button_comes_back(saving, frame, monkeypatch):
+    began, goes_on = threading.Event(), threading.Event()
+
+    def drawn(frame, suffix, step):
+        step(0.2)
+        began.set()
+        assert goes_on.wait(30)
+        step(0.4)
+        pytest.fail("it goes on")
+
+    monkeypatch.setattr("dt_viz.ui.panel.render_figure", drawn)
+    shown(saving, frame)
+    saving.claim(saving["Format"], "SVG")
+    saving.sent.clear()
+    button = saving["Save picture"]
+    saving.claim(button, True)
+    assert began.wait(30)
+    assert button.label == "Cancel"
+    assert saving.gui._thread_executor.submit(lambda: True).result(timeout=20)  # nobody else waits for it
+    saving.claim(button, True)
+    goes_on.set()
+    wait_until(lambda: button.label == "Save picture")
+    assert saving.session.jobs.wait_idle("Save picture", 30) and not saving.sent
+    saving.claim(saving["Format"], "PNG")
+
+
+def texts(svg):
+    return re.findall(r"<text[^>]*>([^<]*)</text>", svg.decode())
+
+
+class TestFigure:
+    def test_its_text_is_text_and_nothing_in_it_is_pixels(self, frame):
+        svg = render_figure(frame, ".svg")
+        assert {"rollouts", "demonstrations", "undisturbed", "obstacle", "goal", "10 cm"} <= set(texts(svg))
+        assert b"<image" not in svg
+        assert b"/Font" in render_figure(frame, ".pdf")
+
+    def test_it_has_what_the_view_shows_in_the_pages_colours(self, at_rest, initial):
+        scenario = initial("draw_s")
+        view = replace(scenario.view, streamlines=True, colour="lyapunov", demonstrations=False, grid=True)
+        names = texts(render_figure(at_rest(replace(scenario, view=view), Stage.FINE), ".svg"))
+        assert {"streamlines", "warped grid", "Lyapunov value, cm²/s"} <= set(names)
+        assert "demonstrations" not in names
+        assert sum(name.isdecimal() for name in names) >= 4  # values on the level lines
+        svg = render_figure(at_rest(scenario, Stage.FINE), ".svg")
+        assert b"#d55e00" in svg and b"#cc79a7" in svg
+
+    def test_an_outline_is_where_the_obstacle_is(self, frame):
+        from dt_viz.ui.scene import figure
+
+        (sphere,) = frame.scenario.obstacles
+        drawn = figure._scene(frame, "")
+        (body,) = drawn.levels
+        covered = np.argwhere(body.values > body.levels[0])
+        spacing = (body.upper - body.lower) / (np.array(body.values.shape) - 1)
+        middle = body.lower + covered.mean(axis=0) * spacing
+        plane = figure._Plane.of(frame.slice.holding([*frame.task.paths, *frame.rollouts]), frame)
+        np.testing.assert_allclose(middle, plane.across(np.array(sphere.position)), atol=2e-3)
+        np.testing.assert_allclose(np.sqrt(len(covered) * spacing.prod() / np.pi), sphere.radius, atol=2e-3)
+
+    def test_level_lines_lie_where_the_function_has_their_value(self, at_rest, initial):
+        """The goal, where the Lyapunov value is 0, is where the drawn lattice has its least value."""
+        from dt_viz.ui.scene import figure
+
+        scenario = initial("draw_s")
+        frame = at_rest(replace(scenario, view=replace(scenario.view, colour="lyapunov")), Stage.FINE)
+        drawn = figure._scene(frame, "")
+        (levels,) = [one for one in drawn.levels if not one.is_body]
+        least = np.array(np.unravel_index(np.nanargmin(levels.values), levels.values.shape))
+        place = levels.lower + least / (np.array(levels.values.shape) - 1) * (levels.upper - levels.lower)
+        np.testing.assert_allclose(place, drawn.points["goal"][0][0], atol=0.01)
