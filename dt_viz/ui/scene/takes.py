@@ -16,13 +16,17 @@ MOST_POINTS = 60_000
 
 
 class Takes(Shown):
-    """Lines of takes, each in its colour, grey and dashed where they are left out; the goal, and the name of one."""
+    """Lines of takes, each in its colour, grey and dashed where they are left out; the goal, and the name of one.
+
+    Of takes that were taught the way of the pointer is dotted, and red where it is out of reach.
+    """
 
     def __init__(self, scene: viser.SceneApi) -> None:
         super().__init__(scene.add_frame("/takes", show_axes=False, visible=False))
         self.learned = [Lines(scene, f"/takes/{k}", STYLES.take, k) for k in range(len(LIGHT.takes))]
         self.given = Lines(scene, "/takes/given", STYLES.take_given)
         self.left_out = Lines(scene, "/takes/left_out", STYLES.take_left_out)
+        self.drawn, self.beyond = Lines(scene, "/takes/drawn", STYLES.drawn), Lines(scene, "/takes/beyond", STYLES.far)
         self.goal = scene.add_frame("/takes/goal", show_axes=False)
         add_ball(scene, "/takes/goal/ball", STYLES.goal)
         add_label(scene, "/takes/goal/label", "goal", height=0.02)
@@ -36,9 +40,14 @@ class Takes(Shown):
             lines.show([_thinned(path, most) for path in own], theme)
         self.given.show([_thinned(take.given, most) for take in seen.takes if take.learned is not None], theme)
         self.left_out.show([_thinned(take.given, min(most, 150)) for take in seen.takes if take.learned is None], theme)
+        self.drawn.show(seen.drawn, theme)
+        self.beyond.show(seen.beyond, theme)
         self.goal.visible = seen.goal is not None
         if seen.goal is not None:
             self.goal.position = seen.goal
+        self.name.visible = bool(seen.takes)
+        if not seen.takes:
+            return
         one = seen.takes[number]
         start = (one.given if one.learned is None else one.learned)[0]
         self.name.text, self.name.position = one.inspection.name[:40], start + np.array([0.0, 0.0, 0.015])
