@@ -25,7 +25,7 @@ from dt_viz.robot.robot import Robot
 from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.tasks import OWN, Task, TaskEntry, own_task
 from dt_viz.session.tasks_in_reach import in_reach
-from dt_viz.session.teaching import Taught, drawn_beyond
+from dt_viz.session.teaching import Taught, crosses_itself, drawn_beyond
 from dt_viz.warning import in_metres
 
 LENGTHS = tuple(unit for unit, (kind, _) in UNITS.items() if kind == "length")
@@ -165,6 +165,10 @@ def preview(recordings: Recordings, choices: Choices, robot: Robot, taught: Sequ
     seen = _inspected(used, choices, robot, board)
     drawn = tuple(each.drawn for each in taught)
     beyond = tuple(drawn_beyond(robot, drawn))
+    if taught and seen.task is not None:  # the plain state takes seconds, and cannot cross
+        seen = replace(seen, task=replace(seen.task, state="augmented"))
+        crossing = [each.take.name for each in taught if each.board is not None and crosses_itself(each.take.values)]
+        said += (f"{', '.join(crossing)} crosses itself: the augmented state is chosen, which can",) * bool(crossing)
     return replace(seen, unit=unit, rate=rate, notes=said, drawn=drawn, beyond=beyond)
 
 

@@ -27,7 +27,7 @@ class TeachingSettings:
     interval: float = 0.05
     """Time between two points that a page sends while the pointer moves, seconds."""
     closest: float = 0.002
-    """Time below which two points arrived together, seconds: the later one counts."""
+    """Time in which points arrived together, seconds: the last one counts."""
     standing: float = 0.15
     """Time without a point from which on the pointer stood still, seconds."""
     most_points: int = 300
@@ -131,7 +131,8 @@ def smoothed(times: Array, points: Array, settings: TeachingSettings = SETTINGS)
     """
     if not (np.isfinite(times).all() and np.isfinite(points).all()):
         raise FormatError("points", "some that are not finite", "places in the scene")
-    last = np.append(np.diff(times) >= settings.closest, True)
+    arrived = np.floor(times / settings.closest)
+    last = np.append(np.diff(arrived) > 0, True)[: len(times)]
     times, points = times[last], points[last]
     length = arc_length(points)[-1] if len(points) > 1 else 0.0
     if len(points) < settings.least_points or length < settings.shortest:
@@ -173,6 +174,18 @@ def _without_noise(times: Array, points: Array, settings: TeachingSettings) -> A
     misfit = ((1 - kept) ** 2 @ parts**2).sum(axis=1)
     score = np.where(left > 0, (misfit + 1e-12 * (parts**2).sum()) / np.maximum(left, 1e-9) ** 2, np.inf)
     return modes @ (kept[np.argmin(score)][:, None] * parts)
+
+
+def crosses_itself(path: Array) -> bool:
+    """Return whether a plane path (N, 2) crosses itself: two of its pieces lie on both sides of each other."""
+    a, b = path[:-1], path[1:]
+
+    def sides(points: Array) -> Array:
+        along, to = (b - a)[:, None], points[None] - a[:, None]
+        return along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0]
+
+    apart = sides(a) * sides(b) < 0
+    return bool((apart & apart.T).any())
 
 
 def drawn_beyond(robot: Robot, paths: Sequence[Array]) -> list[Array]:
