@@ -168,7 +168,8 @@ def preview(recordings: Recordings, choices: Choices, robot: Robot, taught: Sequ
     if taught and seen.task is not None:  # the plain state takes seconds, and cannot cross
         seen = replace(seen, task=replace(seen.task, state="augmented"))
         crossing = [each.take.name for each in taught if each.board is not None and crosses_itself(each.take.values)]
-        said += (f"{', '.join(crossing)} crosses itself: the augmented state is chosen, which can",) * bool(crossing)
+        which = "the augmented state, which remembers the phase, can"
+        said += (f"what crosses itself ({', '.join(crossing)}) no plain motion follows: {which}",) * bool(crossing)
     return replace(seen, unit=unit, rate=rate, notes=said, drawn=drawn, beyond=beyond)
 
 

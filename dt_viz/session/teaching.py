@@ -151,8 +151,9 @@ def _with_stands(times: Array, points: Array, settings: TeachingSettings) -> tup
     moments: list[Array] = [times]
     places: list[Array] = [points]
     for k in np.flatnonzero(np.diff(times) > settings.standing):
-        step = max(settings.interval, (times[k + 1] - times[k]) / settings.most_points)
-        between = np.arange(times[k] + step, times[k + 1] - step / 2, step)
+        pause = float(times[k + 1] - times[k])
+        num = min(round(pause / settings.interval), settings.most_points)
+        between = np.linspace(times[k], times[k + 1], num + 1)[1:-1]
         moments.append(between)
         places.append(np.repeat(points[k][None], len(between), axis=0))
     order = np.argsort(np.concatenate(moments), kind="stable")

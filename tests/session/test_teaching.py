@@ -144,6 +144,7 @@ def test_a_drawing_stays_where_it_was_drawn_whatever_its_size(robot):
         seen = opening.preview(Recordings(), Choices(), robot, [kept])
         np.testing.assert_allclose(seen.takes[0].given[[0, -1]], given.points[[0, -1]], atol=1e-3)
         np.testing.assert_array_equal(seen.drawn[0], given.points)
+        assert seen.task is not None
         again = Own.of(seen.task).checked("kept").task
         np.testing.assert_allclose(again.paths[0], seen.task.paths[0], atol=1e-12)
         assert again.state == "augmented"
@@ -154,7 +155,8 @@ def test_what_crosses_itself_is_said_and_learned(robot, fits):
     plain = opening.preview(Recordings(), Choices(), robot, three(robot))
     assert not any("crosses" in note for note in plain.notes)
     seen = opening.preview(Recordings(), Choices(), robot, three(robot, "8"))
-    assert any("drawn 1, drawn 2, drawn 3 crosses itself" in note for note in seen.notes)
+    assert any("crosses itself (drawn 1, drawn 2, drawn 3)" in note for note in seen.notes)
+    assert seen.task is not None
     learned = learned_of(Scenario("own_data_1"), seen.task, fits)
     assert learned.imitation.state == "augmented"
 

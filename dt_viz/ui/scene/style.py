@@ -47,7 +47,7 @@ class STYLES:
     drawn = Style("ghost", width=0.0014, dash=0.003)
     pen = Style("level", width=0.005)
     far = Style("folded", width=0.0064)
-    teaching_lines = Style("board", width=0.0006)
+    teaching_lines = Style("slice", width=0.0008)
     way = Style("way", width=0.0055)
     trail = Style("way", width=0.005)
     ink = Style("ink", width=0.005)

@@ -6,6 +6,7 @@ import numpy as np
 import viser
 
 from dt_viz.flows.fields import Array
+from dt_viz.metrics import arc_length, resample_by_arc_length
 from dt_viz.session.opening import Preview
 from dt_viz.ui.scene.palette import LIGHT, Theme
 from dt_viz.ui.scene.picture import Lines, Shown, add_ball, add_label
@@ -40,7 +41,7 @@ class Takes(Shown):
             lines.show([_thinned(path, most) for path in own], theme)
         self.given.show([_thinned(take.given, most) for take in seen.takes if take.learned is not None], theme)
         self.left_out.show([_thinned(take.given, min(most, 150)) for take in seen.takes if take.learned is None], theme)
-        self.drawn.show(seen.drawn, theme)
+        self.drawn.show([_dense(path) for path in seen.drawn], theme)
         self.beyond.show(seen.beyond, theme)
         self.goal.visible = seen.goal is not None
         if seen.goal is not None:
@@ -56,3 +57,8 @@ class Takes(Shown):
 def _thinned(path: Array, most: int) -> Array:
     """At most so many of the points (T, 3) of a path."""
     return path[np.unique(np.linspace(0, len(path) - 1, min(len(path), most)).round().astype(int))]
+
+
+def _dense(path: Array, step: float = STYLES.drawn.dash / 2, most: int = 2000) -> Array:
+    """The path (N, 3), metres, with so many samples that it can be dotted."""
+    return resample_by_arc_length(path, min(int(arc_length(path)[-1] / step) + 2, most))
