@@ -13,7 +13,7 @@ from dt_viz.errors import FormatError, naming
 from dt_viz.files.takes import Take
 from dt_viz.flows.fields import Array, Mask
 from dt_viz.learning.demonstrations import DemonstrationError
-from dt_viz.metrics import arc_length
+from dt_viz.metrics import arc_length, resample_by_arc_length
 from dt_viz.robot.placement import REFERENCE_SHOULDER
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.slices import Slice
@@ -177,9 +177,13 @@ def _without_noise(times: Array, points: Array, settings: TeachingSettings) -> A
     return modes @ (kept[np.argmin(score)][:, None] * parts)
 
 
-def crosses_itself(path: Array) -> bool:
-    """Return whether a plane path (N, 2) crosses itself: two of its pieces lie on both sides of each other."""
-    a, b = path[:-1], path[1:]
+def crosses_itself(path: Array, num: int = 41) -> bool:
+    """Return whether a plane path (N, 2), of which so many points are looked at, crosses itself.
+
+    Two of its pieces lie on both sides of each other then; smaller loops, as of a pen that stands, are not seen.
+    """
+    coarse = resample_by_arc_length(path, num)
+    a, b = coarse[:-1], coarse[1:]
 
     def sides(points: Array) -> Array:
         along, to = (b - a)[:, None], points[None] - a[:, None]

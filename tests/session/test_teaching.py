@@ -152,6 +152,8 @@ def test_a_drawing_stays_where_it_was_drawn_whatever_its_size(robot):
 
 def test_what_crosses_itself_is_said_and_learned(robot, fits):
     assert [crosses_itself(curve(np.linspace(0, 1, 100), kind)) for kind in ("S", "8")] == [False, True]
+    u = np.linspace(0, 1, 400)
+    assert not crosses_itself(curve(u) + 0.003 * np.stack([np.sin(90 * u), np.cos(90 * u)], axis=1))  # small loops
     plain = opening.preview(Recordings(), Choices(), robot, three(robot))
     assert not any("crosses" in note for note in plain.notes)
     seen = opening.preview(Recordings(), Choices(), robot, three(robot, "8"))

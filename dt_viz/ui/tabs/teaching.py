@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 from collections.abc import Mapping
 from functools import partial
 
@@ -12,6 +13,7 @@ from dt_viz.session.teaching import Stroke
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.pen import Kind, Pen
 from dt_viz.ui.tabs.opening import OpenPanel
+from dt_viz.ui.tabs.plots import small
 from dt_viz.warning import Severity
 
 KINDS: Mapping[str, Kind] = {"Draw": "draw", "Guide the hand": "guide"}
@@ -38,6 +40,7 @@ class TeachPanel:
         with opening.folder:
             first = opening.table.order - 1
             ways = gui.add_button_group("Teach", tuple(KINDS), hint="adds takes", order=first)
+            self._told = gui.add_html("", order=first + 0.2)
             self._done = gui.add_button("Take done", icon=viser.Icon.CHECK, visible=False, order=first + 0.5)
         opening.control(begin, lambda _pressed: self._begin("draw"))
         opening.control(ways, lambda name: self._begin(KINDS[name]))
@@ -46,7 +49,7 @@ class TeachPanel:
 
     def _begin(self, kind: Kind) -> None:
         self._opening.teach()
-        self._done.visible = kind == "guide"
+        self._done.visible, self._told.content = kind == "guide", small(html.escape(TOLD[kind]))
         self._pen.take_up(kind, partial(self._finished, NAMES[kind]))
         self._bindings.session.say(TOLD[kind], Severity.NOTE)
 
