@@ -4,6 +4,7 @@ They are saved as npz, seconds and metres, for i = 0, 1, 2, …: ``times_i`` (T,
 ``orientations_wxyz_i`` (T, 4) and ``name_i``, a string.
 """
 
+import io
 import logging
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -318,8 +319,8 @@ def _of_hand(take: Take, arm: ForwardKinematics | None) -> Demonstration:
     return Demonstration(take.times, arm.end_effector(q), take.name, None if orientation is None else orientation(q))
 
 
-def save_demonstrations(path: str | Path, demonstrations: Sequence[Demonstration]) -> None:
-    """Write demonstrations as npz; see the module's docstring."""
+def save_demonstrations(path: str | Path | io.BytesIO, demonstrations: Sequence[Demonstration]) -> None:
+    """Write demonstrations as npz, to a path or a buffer; see the module's docstring."""
     arrays: dict[str, Any] = {}
     for i, demonstration in enumerate(demonstrations):
         for field in ("times", "positions", "name"):
@@ -327,6 +328,26 @@ def save_demonstrations(path: str | Path, demonstrations: Sequence[Demonstration
         if demonstration.orientations is not None:
             arrays[f"orientations_wxyz_{i}"] = demonstration.orientations
     np.savez_compressed(path, **arrays)
+
+
+def as_npz(demonstrations: Sequence[Demonstration]) -> bytes:
+    """Return the npz file of demonstrations; see the module's docstring."""
+    file = io.BytesIO()
+    save_demonstrations(file, demonstrations)
+    return file.getvalue()
+
+
+def as_csv(demonstrations: Sequence[Demonstration]) -> bytes:
+    """Return a table with columns demo, t, x, y and perhaps z, seconds and metres, of demonstrations without turns."""
+    lines = [",".join(("demo", "t", *"xyz"[: demonstrations[0].dimension]))]
+    for each in demonstrations:
+        for row in np.column_stack([each.times, each.positions]):
+            lines.append(",".join((each.name.replace(",", " "), *(f"{value:.9g}" for value in row))))
+    return "\n".join([*lines, ""]).encode()
+
+
+WRITERS: Mapping[str, Callable[[Sequence[Demonstration]], bytes]] = {"csv": as_csv, "npz": as_npz}
+"""Writers of a file of demonstrations, by its suffix without the dot."""
 
 
 def lasa_files(folder: str | Path) -> dict[str, Path]:

@@ -11,7 +11,7 @@ from dt_viz.learning.store import FitStore
 from dt_viz.learning.style import Style
 from dt_viz.motion.nominal import Learned
 from dt_viz.scenario.scenario import Scenario
-from dt_viz.scenario.tasks import Task
+from dt_viz.scenario.tasks import OWN, Task
 
 
 def learned_of(scenario: Scenario, task: Task, fits: FitStore, progress: Progress | None = None) -> Learned:
@@ -26,7 +26,9 @@ def learned_of(scenario: Scenario, task: Task, fits: FitStore, progress: Progres
     if imitation is None or imitation.state != state or scenario.objective != "trajectory":
         imitation = fits.learned(task.demonstrations, settings, state, progress)
     if imitation.state == "augmented" and scenario.state == "auto" and not imitation.reason:
-        imitation = replace(imitation, reason="the plain state misses a demonstration of this task")
+        own = task.name.startswith(OWN)
+        why = "it is learned at once" if own else "the plain state misses a demonstration of this task"
+        imitation = replace(imitation, reason=why)
     return Learned.of(task, imitation, imitates=scenario.imitation)
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,8 +22,10 @@ from dt_viz.learning.preparation import ImitationError, Motions, NoCommonGoalErr
 from dt_viz.robot.inverse_kinematics import UnreachableError
 from dt_viz.robot.placement import Placement, fitting, follows, resampled
 from dt_viz.robot.robot import Robot
+from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.tasks import OWN, Task, TaskEntry, own_task
 from dt_viz.session.tasks_in_reach import in_reach
+from dt_viz.session.teaching import Taught, crosses_itself, drawn_beyond
 from dt_viz.warning import in_metres
 
 LENGTHS = tuple(unit for unit, (kind, _) in UNITS.items() if kind == "length")
@@ -47,6 +50,37 @@ class Choices:
     """What is done to takes."""
     fits_reach: bool = False
     """Whether the task is scaled and moved into the arm's reach where it is not in it."""
+
+
+@dataclass(frozen=True)
+class Opened:
+    """What a visitor has opened, and taught."""
+
+    files: tuple[tuple[str, bytes], ...] = ()
+    """Names and contents."""
+    answers: Mapping[str, Any] = field(default_factory=dict)
+    """What was answered to the files' questions, by what these are about."""
+    recordings: Recordings = field(default_factory=Recordings)
+    """What was read of the files."""
+    num_read: int = 0
+    """Number of files of which they were read."""
+    choices: Choices = field(default_factory=Choices)
+    taught: tuple[Taught, ...] = ()
+    """Takes that were taught in the page; they come after those of files."""
+
+    @property
+    def kept(self) -> tuple[Demonstration, ...]:
+        """What is kept of the takes that were taught."""
+        takes = (each.take for each in self.taught)
+        return tuple(Demonstration(take.times, take.values, take.name) for take in takes)
+
+    def without(self, number: int, name: str) -> Opened:
+        """Return the rest without the take of a number among all, and of a name, if that was taught."""
+        kept = tuple(each for each in self.taught if each.take.name != name)
+        if len(kept) == len(self.taught):
+            return self
+        left_out = frozenset(k - (k > number) for k in self.choices.left_out if k != number)
+        return replace(self, taught=kept, choices=replace(self.choices, left_out=left_out))
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +122,10 @@ class Preview:
     """What is out of the arm's reach, and what would fit; empty if nothing is."""
     problem: str = ""
     """Why nothing can be learned."""
+    drawn: tuple[Array, ...] = ()
+    """Places (N_i, 3) of the pointer in takes that were taught, metres."""
+    beyond: tuple[Array, ...] = ()
+    """Pieces (K_i, 3) of these that are out of the arm's reach, metres."""
 
 
 def read(
@@ -104,12 +142,13 @@ def read(
         return read_upload(Recordings, files, cancelled, answers=answers, joint_names=[*robot.joint_names])
 
 
-def preview(recordings: Recordings, choices: Choices, robot: Robot) -> Preview:
-    """Inspect takes and place their task; `with_reach` asks the arm afterwards.
+def preview(recordings: Recordings, choices: Choices, robot: Robot, taught: Sequence[Taught] = ()) -> Preview:
+    """Inspect takes, recorded and taught, and place their task; `with_reach` asks the arm afterwards.
 
     Raises:
         DemonstrationError: no take can be used.
     """
+    recordings = replace(recordings, takes=(*recordings.takes, *(each.take for each in taught)))
     takes = [_copied(take) for take in recordings.takes]
     rate = _rate(takes, choices)
     if choices.unit:
@@ -122,7 +161,16 @@ def preview(recordings: Recordings, choices: Choices, robot: Robot) -> Preview:
     wide = max(float(np.abs(own.positions).max()) for own in used) > robot.reach
     unit = (choices.unit or recognised) if is_open and (note or choices.unit or wide) else ""
     said = tuple(dict.fromkeys([*recordings.refused, *refused, *recordings.notes, *([note] if note else [])]))
-    return replace(_inspected(used, choices, robot), unit=unit, rate=rate, notes=said)
+    board = next((each.board for each in taught if each.board is not None), None)
+    seen = _inspected(used, choices, robot, board)
+    drawn = tuple(each.drawn for each in taught)
+    beyond = tuple(drawn_beyond(robot, drawn))
+    if taught and seen.task is not None:  # the plain state takes seconds, and cannot cross
+        seen = replace(seen, task=replace(seen.task, state="augmented"))
+        crossing = [each.take.name for each in taught if each.board is not None and crosses_itself(each.take.values)]
+        which = "the augmented state, which remembers the phase, can"
+        said += (f"what crosses itself ({', '.join(crossing)}) no plain motion follows: {which}",) * bool(crossing)
+    return replace(seen, unit=unit, rate=rate, notes=said, drawn=drawn, beyond=beyond)
 
 
 def with_reach(seen: Preview, choices: Choices, robot: Robot) -> Preview:
@@ -152,7 +200,9 @@ def _moved(seen: Preview, fits: Placement) -> Preview:
         replace(take, given=fits(take.given), learned=None if take.learned is None else fits(take.learned))
         for take in seen.takes
     )
-    return replace(seen, takes=takes, task=seen.task.placed(fits.scale, fits.shift), goal=fits(seen.goal))
+    drawn = tuple(fits(path) for path in seen.drawn)
+    task = seen.task.placed(fits.scale, fits.shift)
+    return replace(seen, takes=takes, task=task, goal=fits(seen.goal), drawn=drawn, beyond=())
 
 
 def _copied(take: Take) -> Take:
@@ -197,7 +247,7 @@ def _usable(takes: Sequence[Take], robot: Robot) -> tuple[list[Demonstration], l
     return [own for of_hand, own in used if (of_hand, own.dimension) == kind], refused
 
 
-def _inspected(used: Sequence[Demonstration], choices: Choices, robot: Robot) -> Preview:
+def _inspected(used: Sequence[Demonstration], choices: Choices, robot: Robot, board: Slice | None) -> Preview:
     chosen = [k for k in range(len(used)) if k not in choices.left_out]
     settings, goals, goal_number, problem = choices.preparation, (), 0, ""
     found: dict[int, Inspection] = {}
@@ -216,9 +266,12 @@ def _inspected(used: Sequence[Demonstration], choices: Choices, robot: Robot) ->
     given = replace(
         own_task(tuple(used[k] for k in kept)), preparation=settings, seen=() if motions is None else motions.warnings
     )
-    # drawings are placed; positions in space are where they are
-    entry = {OWN: TaskEntry(given.title, lambda: given)}
-    task = in_reach(entry, robot)[OWN]() if used[0].dimension == 2 else given
+    # drawings of files are placed; those on the board, and positions in space, are where they are
+    task = given
+    if used[0].dimension == 2 and board is None:
+        task = in_reach({OWN: TaskEntry(given.title, lambda: given)}, robot)[OWN]()
+    elif used[0].dimension == 2 and board is not None:
+        task = given.placed(1 / given.scale, board.centre - given.origin / given.scale)
     learned = {} if motions is None else dict(zip(numbers, motions.positions, strict=True))
     takes = tuple(
         SeenTake(

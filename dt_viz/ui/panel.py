@@ -23,6 +23,7 @@ from dt_viz.session.progress import Message, Progress
 from dt_viz.session.session import CHOICES, Session
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.controls import Control
+from dt_viz.ui.pen import Pen
 from dt_viz.ui.scene.camera import CameraController
 from dt_viz.ui.scene.figure import render_figure
 from dt_viz.ui.scene.legend import Legend
@@ -37,6 +38,7 @@ from dt_viz.ui.tabs.saving import Step
 from dt_viz.ui.tabs.show import ShowTab
 from dt_viz.ui.tabs.stack import StackPanel
 from dt_viz.ui.tabs.status import COLOURS, StatusLine, hint, hint_html, sentence
+from dt_viz.ui.tabs.teaching import TeachPanel
 from dt_viz.ui.tabs.world import add_obstacles, add_starts, add_transforms
 from dt_viz.warning import Severity
 
@@ -67,11 +69,13 @@ class ControlPanel:
         forget: Callable[[], None] = lambda: None,
         save: Callable[[Session], None] = lambda _session: None,
         open_scenario: Callable[[str, bytes], bool] = lambda _name, _content: False,
+        pen: Pen | None = None,
     ) -> None:
         """Build the controls, for the titles of tasks and arms by name; they act once `connect` has given a session.
 
-        `render` makes a picture, see `PictureTab`; `send` sends a file of a suffix and a content. `save` sends the
-        scenario as a file and must only submit, `open_scenario` goes on with that of a file if it holds one.
+        `render` makes a picture, see `PictureTab`; `send` sends a file whose name ends like this, with a content.
+        `save` sends the scenario as a file and must only submit, `open_scenario` goes on with that of a file if it
+        holds one. A visitor teaches with the `pen`.
         """
         self._notify, self._begin_anew, self._titles = notify, (tripod.view, forget), dict(titles)
         self._notified: Message | None = None
@@ -80,9 +84,11 @@ class ControlPanel:
         self.presentation = Presentation(gui, self._turn, lambda alone: tripod.reframe(alone=alone))
         bindings.show(self._title, lambda title: self.presentation.write(title=title))
         enlarge = big_type(gui, tripod)
-        self._scene = self._add_choices(
-            gui, preview, lambda name, content: open_scenario(name, content) or loader.takes(name, content)
+        opening, self._scene = self._add_choices(
+            gui, preview, lambda name, content: open_scenario(name, content) or loader.takes(name, content), send
         )
+        if pen is not None:
+            TeachPanel(gui, bindings, opening, pen)
         self.hint = gui.add_html(hint_html(""))
         add_avoid_and_imitate(gui, bindings)
         self.status = StatusLine(gui, bindings)
@@ -107,7 +113,7 @@ class ControlPanel:
         with tabs.add_tab("Picture"):
             act = {"darken": darken, "enlarge": enlarge, "render": render, "draw": self._draw, "send": send}
             picture = PictureTab(gui, bindings, tripod, self.presentation, **act)
-        commands = self._commands(gui.main_panel, picture, save)
+        commands = self._commands(gui.main_panel, picture, save, opening)
         add_commands(gui, bindings, commands)
         add_about(gui, commands)
         self.take(robot)
@@ -151,8 +157,14 @@ class ControlPanel:
             self._notify(sentence(message.text), COLOURS[message.severity][0])
         self._notified = message
 
-    def _add_choices(self, gui: viser.GuiApi, preview: Show, take: Callable[[str, bytes], bool]) -> Control:
-        """Add the dropdowns of tasks and scenes, and what opens recordings; return that of the scenes."""
+    def _add_choices(
+        self,
+        gui: viser.GuiApi,
+        preview: Show,
+        take: Callable[[str, bytes], bool],
+        send: Callable[[str, bytes], None],
+    ) -> tuple[OpenPanel, Control]:
+        """Add the dropdowns of tasks and scenes, and what opens recordings; return that, and the one of the scenes."""
 
         def choose(session: Session, title: str) -> None:
             session.choose_task(next(name for name in self._titles if self._titles[name] == title))
@@ -160,8 +172,8 @@ class ControlPanel:
         tasks = gui.add_dropdown("Task", tuple(self._titles.values()), hint="what is learned from demonstrations")
         self.bindings.properties(tasks, options=lambda _: tuple(self._titles.values()))
         self.bindings.choice(tasks, lambda s: self._titles[s.task], partial(self.begin, choose))
-        OpenPanel(gui, self.bindings, preview, self._learn, MAX_UPLOAD, take)
-        return self.bindings.choice(
+        opening = OpenPanel(gui, self.bindings, preview, self._learn, MAX_UPLOAD, take, send)
+        return opening, self.bindings.choice(
             gui.add_dropdown("Scene", (NO_SCENE, *self._scenes), hint="scenes of the paper's figures"),
             lambda s: SCENES[s.scene].title if s.scene in SCENES else NO_SCENE,
             partial(self.begin, self._load),
@@ -252,6 +264,7 @@ class ControlPanel:
         panel: Any,  # noqa: ANN401 - viser's, without a name
         picture: PictureTab,
         save: Callable[[Session], None],
+        opening: OpenPanel,
     ) -> list[Command]:
         folded = False  # a visitor may unfold it by hand, which nobody is told of
 
@@ -261,6 +274,10 @@ class ControlPanel:
                 folded = not folded
                 (panel.minimize if folded else panel.expand)()
 
+        def leave(_session: Session) -> None:
+            self.presentation.show(False)
+            opening.later(opening.close)
+
         return [
             Command("Pause, or play", play_or_pause, "space"),
             Command("Reset the scene and the camera", self._reset, "R"),
@@ -269,6 +286,7 @@ class ControlPanel:
             Command("Save the scenario as a file", save),
             *picture.commands,
             Command("Hide the panel, or show it", fold, "H"),
+            Command("End the presentation, and what is taught or opened", leave, "escape"),
             *self.presentation.commands,
             *numbered(tuple(self._scenes), partial(self.begin, self._load)),
         ]

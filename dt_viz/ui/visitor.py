@@ -21,6 +21,7 @@ from dt_viz.scenario.own import Own
 from dt_viz.scenario.relocation import in_world
 from dt_viz.scenario.saved import Known, Saved, encode, is_saved
 from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.stack import with_avoidance
 from dt_viz.scenario.tasks import TASKS, Task
 from dt_viz.serving.board import Share
@@ -35,6 +36,7 @@ from dt_viz.ui.bindings import EDITS
 from dt_viz.ui.counting import Counted
 from dt_viz.ui.keeping import Keeper
 from dt_viz.ui.panel import ControlPanel
+from dt_viz.ui.pen import Pen
 from dt_viz.ui.playback import Playback
 from dt_viz.ui.scene.camera import CameraController, Framing, view_of
 from dt_viz.ui.scene.export import RESOLUTIONS, render_png
@@ -100,6 +102,7 @@ class Visitor(Display):
             self.robot = RobotScene(client, robot, Playback(engine.arm, self._pose))
         self._exchanging = threading.RLock()  # the arm is moved, and shown or hidden, by other threads
         titled = {"": robot.title} if arms is None else arms.titles
+        pen = Pen(self.pictures, lambda: self.robot, lambda: self.session, self._face)
         methods = tuple(method.name for method in OTHERS)
         self._keeper = Keeper(client.local_storage, Known(titles, titled, methods), self._made)
         self._camera = CameraController(client, lambda: self.robot.hand, robot.size, self._keeper.changed)
@@ -113,10 +116,11 @@ class Visitor(Display):
             partial(notify, client),
             self._camera,
             self._darken,
-            self._preview,
+            partial(self._preview, pen),
             self._keeper.forget,
             self._save,
             self._open,
+            pen,
         )
         begun = self._keeper.begun
         at_once = None if begun is None or _takes_long(begun) else begun.scenario
@@ -144,7 +148,8 @@ class Visitor(Display):
         beside = tuple(panel.shown for panel in frame.pictures.panels)
         if frame.scenario.arm != (self.shown.scenario.arm if self.shown else ""):
             self._exchange(frame.scenario.arm)
-        others = frame.stage is not Stage.ROLLOUTS and len(beside) != len(self._camera.panels)
+        settled = frame.stage is not Stage.ROLLOUTS and self._previews is False
+        others = settled and len(beside) != len(self._camera.panels)
         if self.shown is None or frame.task is not self.shown.task or others:
             self._camera.look(frame.task, beside)
         if (sight := self._keeper.sight(frame)) is not None:
@@ -167,7 +172,7 @@ class Visitor(Display):
     def tell(self, progress: Progress) -> None:
         self._panel.tell(progress)
         if self._previews is None and (progress.failed or not progress.stale):
-            self._preview(None, 0)  # what was seen is learned, or will not be
+            self._end_preview()  # what was seen is learned, or will not be
 
     def close(self) -> None:
         """Stop all work: the visitor has left."""
@@ -204,21 +209,37 @@ class Visitor(Display):
         self._resume(self._keeper.read(content, name))
         return True
 
-    def _preview(self, seen: Preview | None, number: int | None) -> None:
+    def _preview(self, pen: Pen, seen: Preview | None, number: int | None) -> None:
         """Show takes that are not learned yet in place of the motion; see `ui.tabs.opening.Show`."""
+        if seen is None:
+            pen.put_down()
         if number is None:
             self._previews = None
-            return
-        begins, before = seen is not None, self._previews
-        self._previews = begins
+        elif seen is None:
+            self._end_preview()
+        else:
+            before, self._previews = self._previews, True
+            with self.client.atomic():
+                self.pictures.preview(seen, number)
+                self.robot.set_aside(True)
+            if seen.task is not None and not before:
+                self._camera.look(seen.task)
+            self.client.flush()
+
+    def _end_preview(self) -> None:
+        """Show the motion again in place of takes."""
+        self._previews = False
         with self.client.atomic():
-            self.pictures.preview(seen, number)
-            self.robot.set_aside(begins)
-        if seen is not None and seen.task is not None and not before:
-            self._camera.look(seen.task)
-        elif seen is None and self.shown is not None:
+            self.pictures.preview(None, 0)
+            self.robot.set_aside(False)
+        if self.shown is not None:
             self._camera.look(self.shown.task, tuple(panel.shown for panel in self.shown.pictures.panels))
         self.client.flush()
+
+    def _face(self, board: Slice | None) -> None:
+        """Move the camera straight before a board, or to where all is seen."""
+        if self.shown is not None:
+            self._camera.look(self.shown.task, () if board is None else (board,))
 
     def _pose(self) -> None:
         now = time.monotonic()

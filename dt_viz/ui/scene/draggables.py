@@ -299,6 +299,9 @@ class MovableSlice(MarkerGroup[Marker]):
 class Grip(Draggable[Marker]):
     """A ball that moves with the hand, and is dragged parallel to the slice: the arm takes it there."""
 
+    _slice: Slice | None = None
+    """Slice of the last frame."""
+
     def __init__(
         self,
         scene: viser.SceneApi,
@@ -322,14 +325,27 @@ class Grip(Draggable[Marker]):
         self._note = add_label(scene, f"{node}/grip/note", anchor="bottom-left", visible=False)
         self._said = ""
         self._held = held
+        self._guided: Callable[[Array, str], None] | None = None
+        """Told of drags instead, which are then across the line of sight, not parallel to the slice."""
         Marker(self, self.node, self.node, where=where)
 
     def draw(self, frame: Frame, look: Look) -> None:
         """Remembers the slice for drags."""
-        self.area = frame.slice
+        self._slice = frame.slice
+        self.guide(self._guided)
+
+    def guide(self, told: Callable[[Array, str], None] | None) -> None:
+        """Have drags told in place of holding the hand, in any direction across the line of sight; None ends that."""
+        self._guided = told
+        self.area = None if told is not None else self._slice
+
+    @property
+    def guides(self) -> bool:
+        """Whether drags are told in place of holding the hand."""
+        return self._guided is not None
 
     def moved(self, marker: Marker, position: Array, wxyz: Array, phase: str) -> None:
-        self._held(position, phase)
+        (self._guided or self._held)(position, phase)
 
     @contextmanager
     def hidden(self) -> Iterator[None]:

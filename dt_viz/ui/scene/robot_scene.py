@@ -79,7 +79,7 @@ class RobotScene:
         view = self._view
         self.carried.show(arm=view.arm and not self._aside)
         self.path.visible = view.arm and not view.replay and not self._aside
-        self.grip.visible = not view.replay and not self._aside
+        self.grip.visible = not view.replay and (not self._aside or self.grip.guides)
 
     def adopt(self, view: View, look: Look) -> None:
         """Show and hide what a view says, beside a frame that was drawn with a look."""

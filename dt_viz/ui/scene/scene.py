@@ -18,6 +18,7 @@ from dt_viz.session.frame import Frame
 from dt_viz.session.opening import Preview
 from dt_viz.session.session import Session
 from dt_viz.ui.scene.arm import ArmSequence
+from dt_viz.ui.scene.board import Board
 from dt_viz.ui.scene.comparison import ComparedMotions
 from dt_viz.ui.scene.draggables import BiasPoints, MovableSlice, Obstacles, Starts
 from dt_viz.ui.scene.palette import LIGHT, Theme
@@ -98,6 +99,8 @@ class ScenePictures:
             "occupancy": OccupancySlice(scene),
         }
         self._takes = Takes(scene)
+        self.board = Board(scene)
+        """What a visitor draws on."""
         self._showing = threading.Lock()  # views change on another thread than the one that draws
         self._drawing = threading.Lock()
         self._frame: Frame | None = None

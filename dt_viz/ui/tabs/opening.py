@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import viser
 
 from dt_viz.errors import DataError
-from dt_viz.files.recordings import ARCHIVE, AXES, NO_COLUMN, Recordings
+from dt_viz.files.recordings import ARCHIVE, AXES, NO_COLUMN
 from dt_viz.files.takes import READERS
+from dt_viz.learning.demonstrations import WRITERS
 from dt_viz.learning.inspection import FindingKind
 from dt_viz.obstacles.files import MESH_SUFFIXES
+from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.tasks import Task
 from dt_viz.session import opening
-from dt_viz.session.opening import LENGTHS, USUAL_RATES, Choices, Preview
+from dt_viz.session.opening import LENGTHS, USUAL_RATES, Choices, Opened, Preview
 from dt_viz.session.session import Session
+from dt_viz.session.teaching import Stroke, taught
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.controls import Control
 from dt_viz.ui.scene.palette import LIGHT
@@ -48,21 +51,6 @@ READINGS = {"t,x,y": "times", "x,y,z": "x, as the next ones are y and z"}
 """What the first of three columns without names is, by the reading of all three."""
 
 
-@dataclass(frozen=True)
-class Opened:
-    """What a visitor has opened."""
-
-    files: tuple[tuple[str, bytes], ...] = ()
-    """Names and contents."""
-    answers: Mapping[str, Any] = field(default_factory=dict)
-    """What was answered to the files' questions, by what these are about."""
-    recordings: Recordings = field(default_factory=Recordings)
-    """What was read of the files."""
-    num_read: int = 0
-    """Number of files of which they were read."""
-    choices: Choices = field(default_factory=Choices)
-
-
 Show = Callable[[Preview | None, int | None], None]
 """Function that shows a preview in the scene, and which take of it is chosen. No preview ends it: at once or, with no
 take, when what is wanted is shown."""
@@ -79,10 +67,12 @@ class OpenPanel:
         learn: Callable[[Session, Task], None],
         most: int,
         take: Callable[[str, bytes], bool],
+        send: Callable[[str, bytes], None],
     ) -> None:
         """Build the controls where the panel is being built; files may have `most` bytes together.
 
-        `take` is given the name and the content of each file first, and returns whether it holds something else.
+        `take` is given the name and the content of each file first, and returns whether it holds something else; `send`
+        sends a file whose name ends like this, with a content.
         """
         self._bindings, self._show, self._learn, self._most, self._take = bindings, show, learn, most, take
         self._changing = threading.RLock()  # one thread reads, another inspects, and handlers close what is open
@@ -98,42 +88,46 @@ class OpenPanel:
         self.folder = gui.add_folder("Your data", visible=False)
         with self.folder:
             self.table = gui.add_html("")
-            self.controls = self._add_controls(gui)
+            self.controls = self._add_controls(gui, send)
             start = gui.add_button("Learn", color=LIGHT.brand, disabled=True)
             cancel = gui.add_button("Cancel", color="gray")
-        self.controls["learn"] = self._control(start, lambda _pressed: self._press())
-        self._control(cancel, lambda _pressed: self.close())
+        self.controls["learn"] = self.control(start, lambda _pressed: self._press())
+        self.control(cancel, lambda _pressed: self.close())
         bindings.show(lambda s: (s.task, s.scene), lambda _chosen: self.close())
         bindings.show(lambda s: s.arm, lambda _arm: self._again())
 
         @self.upload.on_upload
         async def _(_event: viser.GuiEvent) -> None:
             file = self.upload.value
-            self._later(partial(self.load, file.name, file.content))
+            self.later(partial(self.load, file.name, file.content))
 
-    def _later(self, work: Callable[[], None]) -> None:
+    def later(self, work: Callable[[], None]) -> None:
         """Do work on what is open, one after the other, beside the server's event loop."""
         self._bindings.session.jobs.submit(CHOOSING, work)
 
-    def _control(self, handle: Any, act: Callable[[Any], None]) -> Control:  # noqa: ANN401 - handles of all kinds
+    def control(self, handle: Any, act: Callable[[Any], None]) -> Control:  # noqa: ANN401 - handles of all kinds
         """Act on each value of an input, or press of a button."""
-        return Control(handle, lambda value: self._later(partial(act, value)))
+        return Control(handle, lambda value: self.later(partial(act, value)))
 
-    def _add_controls(self, gui: viser.GuiApi) -> dict[str, Control]:
+    def _add_controls(self, gui: viser.GuiApi, send: Callable[[str, bytes], None]) -> dict[str, Control]:
         """Build what is shown only where it is asked for, by names of their own."""
         at, found = self._choose, {}
 
         def dropdown(name: str, label: str, options: tuple[str, ...], act: Callable[[str], Any], hint: str) -> None:
-            found[name] = self._control(gui.add_dropdown(label, options, hint=hint, visible=False), act)
+            found[name] = self.control(gui.add_dropdown(label, options, hint=hint, visible=False), act)
 
         dropdown("take", "Take", (NO_COLUMN,), self._point, "the take that is named in the scene")
         box = gui.add_checkbox("Use this take", True, visible=False)
-        found["chosen"] = self._control(box, self._leave_out)
+        found["chosen"] = self.control(box, self._leave_out)
+        button = gui.add_button("Delete this take", icon=viser.Icon.TRASH, color="gray", visible=False)
+        found["delete"] = self.control(button, lambda _pressed: self._delete())
+        group = gui.add_button_group("Download", tuple(WRITERS), hint="the takes that you have taught", visible=False)
+        found["download"] = self.control(group, lambda kind: send(f"-takes.{kind}", WRITERS[kind](self._opened.kept)))
         for kind, (name, label, hint) in SWITCHES.items():
             box = gui.add_checkbox(label, True, hint=hint, visible=False)
-            found[kind] = self._control(box, lambda on, name=name: at(lambda c: {"preparation": _with(c, name, on)}))
+            found[kind] = self.control(box, lambda on, name=name: at(lambda c: {"preparation": _with(c, name, on)}))
         box = gui.add_checkbox("Scale to fit", False, hint="into the arm's reach", visible=False)
-        found["reach"] = self._control(box, lambda on: at(lambda _: {"fits_reach": on}))
+        found["reach"] = self.control(box, lambda on: at(lambda _: {"fits_reach": on}))
         hint = "the place at which motions end; takes that end elsewhere are left out"
         dropdown("goal", "Goal", ("1",), lambda goal: at(lambda _: {"goal": int(goal.split()[0]) - 1}), hint)
         dropdown("unit", "Unit", LENGTHS, lambda unit: at(lambda _: {"unit": unit}), "of positions in files")
@@ -180,13 +174,40 @@ class OpenPanel:
                 self._opened, self.folder.visible = replace(self._opened, files=files), True
                 session.jobs.submit(LANE, self._read)
 
+    def teach(self) -> None:
+        """Open the folder for takes that are taught, beside those of files if there are any."""
+        with self._changing:
+            self.folder.visible = True
+            if self._seen is None:
+                self._put(self._opened, Preview(()))
+
+    def add(self, kind: str, stroke: Stroke, board: Slice | None) -> None:
+        """Keep a stroke, on a board or in space, as a take of a kind, or say why it is none."""
+        numbers = [int(each.take.name.rpartition(" ")[2]) for each in self._opened.taught]
+        try:
+            kept = taught(f"{kind} {max(numbers, default=0) + 1}", stroke, board)
+        except DataError as error:
+            self._bindings.session.say(str(error), Severity.WARNING)
+            return
+        with self._changing:
+            if self.folder.visible:
+                self._opened = replace(self._opened, taught=(*self._opened.taught, kept))
+                self._bindings.session.jobs.submit(SEEING, self._see, latest=True)
+
+    def _delete(self) -> None:
+        """Delete the take that is chosen, if it was taught."""
+        with self._changing:
+            self._opened = self._opened.without(self._number, self._named)
+            self._bindings.session.jobs.submit(SEEING, self._see, latest=True)
+
     def _again(self) -> None:
         """Read what is open for another arm: its joints' angles lead elsewhere, and it reaches other places."""
         with self._changing:
-            if self._opened.files:
+            if self._opened.files or self._opened.taught:
                 self._opened, self._seen = replace(self._opened), None  # what is being inspected is not put
                 self._draw()
-                self._bindings.session.jobs.submit(LANE, self._read, latest=True)
+                lane, work = (LANE, self._read) if self._opened.files else (SEEING, self._see)
+                self._bindings.session.jobs.submit(lane, work, latest=True)
 
     def _read(self) -> None:
         """Read the files of what is open with what was answered; without the newest one if it cannot be read.
@@ -206,7 +227,7 @@ class OpenPanel:
         except DataError as error:
             session.say(str(error), Severity.ALARM)
             self._change(opened.files, files=opened.files[: opened.num_read])
-            if not self._opened.files:
+            if not (self._opened.files or self._opened.taught):
                 self.close()
         else:
             self._change(opened.files, recordings=known, num_read=len(opened.files))
@@ -223,8 +244,11 @@ class OpenPanel:
     def _see(self) -> None:
         """Show what is open, at first without what the arm can reach; nothing once it is changed or closed."""
         opened, robot = self._opened, self._bindings.session.robot
+        if not (opened.recordings.takes or opened.taught):
+            self._put(opened, Preview(()))
+            return
         try:
-            seen = opening.preview(opened.recordings, opened.choices, robot)
+            seen = opening.preview(opened.recordings, opened.choices, robot, opened.taught)
         except DataError as error:  # such as in another unit
             self._bindings.session.say(str(error), Severity.ALARM)
             return
@@ -261,6 +285,12 @@ class OpenPanel:
         value = self.controls["take"].value
         return options.index(value) if value in options else 0
 
+    @property
+    def _named(self) -> str:
+        """Name of the take that is chosen; empty if there is none."""
+        takes = () if self._seen is None else self._seen.takes
+        return takes[self._number].inspection.name if takes else ""
+
     def _point(self, _title: str) -> None:
         with self._changing:
             self._draw()
@@ -288,13 +318,17 @@ class OpenPanel:
                 control.handle.visible = control.handle.visible and name == "learn"
             return
         titles = tuple(f"{k} · {take.inspection.name}"[:40] for k, take in enumerate(seen.takes, 1))
-        self._offer("take", titles, self.controls["take"].value)
+        before = self.controls["take"]
+        newest = opened.taught and len(titles) > len(before.handle.options) * before.handle.visible
+        self._offer("take", titles, titles[-1] if newest else before.value)
         number, settings = self._number, opened.choices.preparation
-        self._turn("chosen", seen.takes[number].is_chosen, shown=True)
+        self._turn("chosen", not titles or seen.takes[number].is_chosen, shown=bool(titles))
+        self.controls["delete"].handle.visible = self._named in [each.take.name for each in opened.taught]
+        self.controls["download"].handle.visible = bool(opened.taught)
         found = {finding.kind for take in seen.takes for finding in take.inspection.findings}
         for kind, (name, *_) in SWITCHES.items():
             on = bool(getattr(settings, name))
-            self._turn(kind, on, shown=kind in found or not on)
+            self._turn(kind, on, shown=bool(titles) and (kind in found or not on))
         self._turn("reach", opened.choices.fits_reach, shown=bool(seen.reach))
         goals = tuple(f"{k} · {text}"[:60] for k, text in enumerate(seen.goals, 1))
         self._offer("goal", goals, goals[seen.goal_number] if goals else "")

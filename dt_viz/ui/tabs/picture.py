@@ -154,7 +154,6 @@ class Presentation:
         """Begin and end it; the scenes can be turned with the panel, too."""
         return [
             Command("Presentation: the scene without the panel, or with it", lambda _: self.show(not self.on), "P"),
-            Command("End the presentation", lambda _: self.show(False), "escape"),
             Command("Next scene", lambda _: self._turn(1), "pagedown"),
             Command("Previous scene", lambda _: self._turn(-1), "pageup"),
         ]

@@ -35,6 +35,8 @@ def seen_html(seen: Preview, number: int) -> str:
     told = [f"<div style='color:{colour}'>{html.escape(sentence(text))}</div>" for colour, text in said]
     found = {finding.kind for take in seen.takes if take.learned is not None for finding in take.inspection.findings}
     heads: list[FindingKind] = [kind for kind in HEADS if kind in found]
+    if not seen.takes:
+        return small("".join(told))
     rows = "".join(_row(k, take, heads, chosen=k == number) for k, take in enumerate(seen.takes))
     named = [("time<br>s", "duration"), ("<br>n", "samples"), ("rate<br>Hz", "samples a second")]
     titles = "".join(

@@ -1,0 +1,217 @@
+"""Teaching in the page: a press, a drag and a release on the board is a take; nothing forged becomes one."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import viser  # noqa: TID251 - a second server
+from pages import PATIENCE, Page, wait_until
+
+from dt_viz.session.session import CHOICES
+from dt_viz.session.teaching import board_of
+from dt_viz.ui import pen
+from dt_viz.ui.tabs.opening import CHOOSING, SEEING
+
+BOARD = "/teaching/board"
+U = np.linspace(0, 1, 40)
+S = np.stack([-0.11 * np.sin(1.5 * np.pi * (2 * U - 1)), -0.34 * (U - 0.5)], axis=1)
+
+
+class Teaching:
+    """A page, its visitor's clicks, and a clock that goes on by a twentieth of a second with each event."""
+
+    def __init__(self, page: Page, robot, monkeypatch) -> None:
+        self.page, self.board, self.told = page, board_of(robot), []
+        self._now = 0.0
+        monkeypatch.setattr(pen, "time", SimpleNamespace(monotonic=self._tick))
+        monkeypatch.setattr(page.session, "say", lambda text, _severity: self.told.append(text))
+
+    def _tick(self):
+        self._now += 0.05
+        return self._now
+
+    def choose(self, label, value=True):
+        self.page.claim(self.page[label], value)
+        self.done()
+
+    def done(self):
+        for lane in (CHOOSING, SEEING, CHOICES, pen.LANE):
+            assert self.page.session.jobs.wait_idle(lane, PATIENCE)
+
+    def draw(self, places, name=BOARD):
+        for k, place in enumerate(places):
+            self.page.drag(name, places[0], place, "start" if k == 0 else "update")
+        self.page.drag(name, places[0], places[-1], "end")
+        self.done()
+
+    def draw_s(self, size=1.0):
+        self.draw(self.board.at(size * S))
+
+    @property
+    def shown(self):
+        return self.page.visitor.pictures
+
+    @property
+    def takes(self):
+        return self.shown._takes
+
+    @property
+    def num_kept(self):
+        return sum(len(lines.node.points) > 0 for lines in self.takes.learned)
+
+    @property
+    def grip(self):
+        return self.page.visitor.robot.grip
+
+
+@pytest.fixture(name="teaching")
+def _teaching(server, robot, monkeypatch):
+    page = Page(server, robot)
+    yield Teaching(page, robot, monkeypatch)
+    page.close()
+    server.gui.reset()
+    server.scene.reset()
+
+
+def is_shown(page, label):
+    return any(handle.label == label and handle.visible for handle in page.inputs)
+
+
+def test_three_takes_are_drawn_deleted_and_learned_as_a_task_of_ones_own(teaching):
+    page = teaching.page
+    assert not teaching.shown.board.visible
+    teaching.choose("Draw your own")
+    assert teaching.shown.board.visible and "Press on the board" in teaching.told[-1]
+    assert page["Learn"].disabled and not is_shown(page, "Delete this take")
+    for k in range(3):
+        teaching.draw_s(1 + 0.03 * k)
+        assert teaching.num_kept == k + 1
+    assert teaching.takes.name.text == "drawn 3" and not page["Learn"].disabled
+    drawn = teaching.board.at(S)
+    on_line = np.linalg.norm(teaching.takes.drawn.node.points[:, :1] - drawn[None], axis=-1).min(axis=1)
+    assert on_line.min() < 1e-3
+    path = np.concatenate(teaching.takes.learned[0].node.points)
+    assert np.linalg.norm(path[:, None] - drawn, axis=-1).min(axis=1).max() < 0.02
+    teaching.choose("Take", "2 · drawn 2")
+    teaching.choose("Delete this take")
+    assert teaching.num_kept == 2 and page["Take"].options == ("1 · drawn 1", "2 · drawn 3")
+    teaching.draw_s()
+    assert teaching.takes.name.text == "drawn 4"
+    teaching.choose("Learn")
+    task = page.session.task
+    assert page.session.scenario.task == "own_data_1" and len(task.demonstrations) == 3 and task.state == "augmented"
+    np.testing.assert_allclose(task.paths[0][0], teaching.board.at(S)[0], atol=0.005)
+    assert not teaching.shown.board.visible and not teaching.grip.guides
+    page.session.undo()
+    assert page.session.scenario.task == "draw_s"
+
+
+def test_cancel_escape_and_another_task_end_it(teaching):
+    page = teaching.page
+    for leave in (
+        lambda: teaching.choose("Cancel"),
+        lambda: page.give(page.commands["End the presentation, and what is taught or opened"]),
+        lambda: teaching.choose("Task", "Draw J"),
+    ):
+        teaching.choose("Draw your own")
+        teaching.draw_s()
+        assert teaching.num_kept == 1 and not teaching.shown._always[-1].visible
+        leave()
+        teaching.done()
+        assert not teaching.takes.visible and not teaching.shown.board.visible
+        assert teaching.shown._always[-1].visible and not is_shown(page, "Delete this take")
+        teaching.choose("Draw your own")
+        assert teaching.num_kept == 0 or not page["Learn"].visible or page["Learn"].disabled
+        teaching.choose("Cancel")
+
+
+def test_the_hand_is_guided_over_several_drags_until_the_take_is_done(teaching):
+    teaching.choose("Draw your own")
+    assert not teaching.grip.guides and not is_shown(teaching.page, "Take done")
+    teaching.choose("Teach", "Guide the hand")
+    assert teaching.grip.guides and teaching.grip.visible and not teaching.shown.board.plate.visible
+    node = teaching.grip.node.name
+    begin = np.array([0.0, -0.4, 0.4])
+    teaching.draw([begin + np.array([0.0, 0.0, -0.01 * k]) for k in range(10)], node)
+    teaching.draw([begin + np.array([0.0, -0.01 * k, -0.09]) for k in range(10)], node)
+    assert teaching.num_kept == 0
+    teaching.choose("Take done")
+    assert teaching.num_kept == 1 and teaching.takes.name.text == "guided 1"
+    teaching.choose("Cancel")
+    assert not teaching.grip.guides
+
+
+def test_what_is_no_take_is_said_and_ignored(teaching):
+    teaching.choose("Draw your own")
+    teaching.draw([teaching.board.centre])
+    assert teaching.told[-1].startswith("drawn 1: take: found") and teaching.num_kept == 0
+    teaching.draw(np.broadcast_to(teaching.board.centre, (50, 3)))
+    assert "0 mm long" in teaching.told[-1]
+    told = len(teaching.told)
+    nowhere = teaching.board.centre + np.array([3.0, 0.0, 0.0])
+    teaching.draw(np.broadcast_to(nowhere, (50, 3)))
+    assert len(teaching.told) == told and teaching.num_kept == 0
+    for place in ((np.nan, 0.0, 0.0), (np.inf, 0.0, 0.0), (1e300, 0.0, 0.0), ("x", 0.0, 0.0), ()):
+        teaching.page.drag(BOARD, teaching.board.centre, place)
+    teaching.draw_s()
+    assert teaching.num_kept == 1
+    assert np.isfinite(teaching.takes.drawn.node.points).all()
+
+
+def test_a_drag_of_the_board_that_is_not_there_teaches_nothing(teaching):
+    teaching.draw_s()
+    assert not teaching.takes.visible and teaching.told == []
+    teaching.choose("Draw your own")
+    teaching.choose("Cancel")
+    teaching.draw_s()
+    assert not teaching.takes.visible
+
+
+def test_many_points_become_a_take(teaching):
+    teaching.choose("Draw your own")
+    fine = np.linspace(0, 39, 1500)
+    teaching.draw(teaching.board.at(np.stack([np.interp(fine, np.arange(40), x) for x in S.T], axis=1)))
+    assert teaching.num_kept == 1
+
+
+def test_the_arm_follows_the_pen_and_minds_no_hidden_obstacle(teaching, monkeypatch):
+    live, held, minded = teaching.page.visitor.robot.playback.live, [], []
+    monkeypatch.setattr(live, "hold", held.append)
+    monkeypatch.setattr(live, "see", minded.append)
+    teaching.choose("Draw your own")
+    assert minded == [None]
+    teaching.draw_s()
+    np.testing.assert_allclose(held[-1], teaching.board.at(S)[-1], atol=1e-6)
+    released = []
+    monkeypatch.setattr(live, "release", lambda: released.append(True))
+    teaching.choose("Cancel")
+    assert released == [True]
+
+
+def test_taught_takes_are_downloaded(teaching, monkeypatch):
+    sent = {}
+    teaching.choose("Draw your own")
+    assert not is_shown(teaching.page, "Download")
+    teaching.draw_s()
+    monkeypatch.setattr(
+        teaching.page.client, "send_file_download", lambda name, content, **_how: sent.update({name: content})
+    )
+    for kind in ("csv", "npz"):
+        teaching.choose("Download", kind)
+    assert sent["takes.csv"].startswith(b"demo,t,x,y\ndrawn 1,0,") and sent["takes.npz"][:2] == b"PK"
+
+
+def test_two_visitors_draw_at_once_and_each_has_its_own(teaching, robot, monkeypatch):
+    beside = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    other = Teaching(Page(beside, robot), robot, monkeypatch)
+    try:
+        teaching.choose("Draw your own")
+        other.choose("Draw your own")
+        teaching.draw_s()
+        other.draw_s()
+        other.draw_s()
+        wait_until(lambda: other.num_kept == 2)
+        assert teaching.num_kept == 1
+    finally:
+        other.page.close()
+        beside.stop()
