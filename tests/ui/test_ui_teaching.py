@@ -198,7 +198,9 @@ def test_taught_takes_are_downloaded(teaching, monkeypatch):
     )
     for kind in ("csv", "npz"):
         teaching.choose("Download", kind)
-    assert sent["takes.csv"].startswith(b"demo,t,x,y\ndrawn 1,0,") and sent["takes.npz"][:2] == b"PK"
+    table, arrays = (content for _, content in sorted(sent.items()))
+    assert sorted(sent) == ["dt-viz-draw_s-takes.csv", "dt-viz-draw_s-takes.npz"]
+    assert table.startswith(b"demo,t,x,y\ndrawn 1,0,") and arrays[:2] == b"PK"
 
 
 def test_two_visitors_draw_at_once_and_each_has_its_own(teaching, robot, monkeypatch):
