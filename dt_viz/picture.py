@@ -171,9 +171,8 @@ def _rendered(task: str, scenario: Callable[[Task], Scenario], size: tuple[int, 
                 raise TimeoutError(f"the page shows no motion of {task}")
             if frame.arm is not None:
                 visitor.robot.playback.live.put(frame.arm.q[round(SETTINGS.along * (len(frame.arm.q) - 1))])
-            visitor.render_alone(
-                (SETTINGS.smallest, SETTINGS.smallest), SETTINGS.patience
-            )  # all that was sent is there
+            least = SETTINGS.smallest
+            visitor.render_alone((least, least), SETTINGS.patience)  # the browser then has all that was sent
             time.sleep(SETTINGS.drawing)
             return visitor.render_alone(size, SETTINGS.patience)
     finally:

@@ -122,7 +122,7 @@ async def _visited(
         visits, num_edits = [*map(Visit, clients)], max(1, round(SETTINGS.edits_per_second * options.seconds))
         before, num_before = used(process), sum(client.num_messages for client in clients)
         began = time.perf_counter()
-        roles = [role_of(options, k) for k in range(number)]
+        roles = roles_of(options, number)
         doings = (
             _doing(options, visit, role, places_of(task, k, num_edits))
             for k, (visit, role) in enumerate(zip(visits, roles, strict=True))
@@ -177,14 +177,14 @@ class _Role(Enum):
 DRAGS = (_Role.DRAG, _Role.DRAG_IN_BURSTS)
 
 
-def role_of(options: argparse.Namespace, number: int) -> _Role:
-    """Return what the visitor with this number does."""
+def roles_of(options: argparse.Namespace, number: int) -> list[_Role]:
+    """Return what each of so many visitors does: in a lecture at random, as processes take visitors in turn."""
     if not options.lecture:
-        return _Role.LOOK_ON if options.rest else _Role.DRAG
-    turn = number % SETTINGS.lecture
-    if turn in SETTINGS.dragging:
-        return _Role.DRAG_IN_BURSTS
-    return _Role.CHANGE_TASK if turn in SETTINGS.changing else _Role.LOOK_ON
+        return [_Role.LOOK_ON if options.rest else _Role.DRAG] * number
+    num_dragging, num_changing = (round(part * number) for part in (SETTINGS.dragging, SETTINGS.changing))
+    roles = [_Role.DRAG_IN_BURSTS] * num_dragging + [_Role.CHANGE_TASK] * num_changing
+    roles += [_Role.LOOK_ON] * (number - len(roles))
+    return [roles[k] for k in np.random.default_rng(SETTINGS.seed).permutation(number)]
 
 
 def _doing(options: argparse.Namespace, visit: Visit, role: _Role, places: Sequence[Point]) -> Awaitable[None]:

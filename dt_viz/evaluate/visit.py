@@ -37,12 +37,12 @@ class LoadSettings:
     """Time that somebody in a lecture drags."""
     pause: float = 4.0
     """Time from there to the next drag, and from one change of the task to the next."""
-    lecture: int = 20
-    """Number of visitors of a lecture after which roles come again."""
-    dragging: tuple[int, ...] = (0, 4, 8, 12, 16)
-    """Which of them drag."""
-    changing: tuple[int, ...] = (2,)
-    """Which of them change the task; the others look on."""
+    dragging: float = 1 / 4
+    """Part of a lecture's visitors that drags."""
+    changing: float = 1 / 20
+    """Part of them that changes the task; the others look on."""
+    seed: int = 0
+    """Seed of who does what."""
     answered: float = 0.5
     """Time within which an edit counts as answered."""
 

@@ -202,12 +202,11 @@ class Arm:
         Raises:
             FormatError: the arm cannot follow the motion, or stands still.
         """
-        missed, robot = float(joints.error.max()), self.robot
+        missed = float(joints.error.max())
         if not joints.gives_way and missed > MAX_TRACKING_ERROR:
             found = f"one beside which the hand is up to {in_millimetres(missed)}"
             raise FormatError("the path", found, f"paths that the arm follows to {in_millimetres(MAX_TRACKING_ERROR)}")
-        limits = (robot.lower, robot.upper), robot.velocity_limits, acceleration
-        return rest_to_rest(robot.joint_names, joints.times, joints.q, *limits)
+        return rest_to_rest(self.robot, joints.times, joints.q, acceleration)
 
     def _turned(self, q: Array, orientations: Array | None) -> Array | None:
         """Angles (T,), degrees, of the hand at postures (T, n) from orientations (T, 4)."""

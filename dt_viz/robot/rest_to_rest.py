@@ -22,6 +22,7 @@ from scipy.interpolate import BSpline, CubicSpline
 from dt_viz.errors import FormatError
 from dt_viz.flows.fields import Array
 from dt_viz.robot.joint_trajectory import JointTrajectory
+from dt_viz.robot.robot import Robot
 
 Moving = Callable[[Array], tuple[Array, Array, Array]]
 """Positions, velocities and accelerations, each (T, n), at times (T,)."""
@@ -50,29 +51,21 @@ class TrajectorySettings:
 
 
 def rest_to_rest(
-    joint_names: tuple[str, ...],
-    times: Array,
-    q: Array,
-    limits: tuple[Array, Array],
-    velocity_limits: Array,
-    acceleration: float,
-    settings: TrajectorySettings | None = None,
+    robot: Robot, times: Array, q: Array, acceleration: float, settings: TrajectorySettings | None = None
 ) -> JointTrajectory:
     """Time a motion anew, from rest to rest, and no faster than it is.
 
     Args:
-        joint_names: of the n joints.
+        robot: the arm, of n joints.
         times: (T,) seconds, not decreasing.
         q: (T, n) joint angles, rad; those of continuous joints unwrapped.
-        limits: (n,) lower and (n,) upper limits of the joints, rad; infinite for continuous joints.
-        velocity_limits: (n,) rad/s.
         acceleration: limit for each joint, rad/s².
         settings: what may be chosen; None are the defaults.
 
     Raises:
         FormatError: the motion stands still, or jumps, or a joint leaves its range.
     """
-    chosen = settings or TrajectorySettings()
+    chosen, joint_names = settings or TrajectorySettings(), robot.joint_names
     steps = np.abs(np.diff(q, axis=0)).max(axis=1, initial=0.0)
     if len(steps) and steps.max() > chosen.jump:
         name = joint_names[np.abs(np.diff(q, axis=0)[steps.argmax()]).argmax()]
@@ -81,18 +74,16 @@ def rest_to_rest(
     kept = _distinct(q, chosen.distinct)
     if len(kept) < 2:
         raise FormatError("the joints", "an arm that stands still", "a motion")
-    moving, end = _timed(times[kept], q[kept], velocity_limits, acceleration, chosen)
+    moving, end = _timed(times[kept], q[kept], robot.velocity_limits, acceleration, chosen)
     at = _points(moving, np.linspace(0, end, int(np.ceil(end / chosen.spacing)) + 1), chosen.error)
     found = JointTrajectory(joint_names, at, *moving(at))
-    curve, dense = (
-        found.quintics,
-        np.concatenate([np.linspace(at[:-1], at[1:], 16, endpoint=False).ravel("F"), at[-1:]]),
-    )
-    beyond = np.maximum(limits[0] - curve(dense), curve(dense) - limits[1]).max(axis=0)
+    curve = found.quintics
+    dense = np.concatenate([np.linspace(at[:-1], at[1:], 16, endpoint=False).ravel("F"), at[-1:]])
+    beyond = np.maximum(robot.lower - curve(dense), curve(dense) - robot.upper).max(axis=0)
     if beyond.max() > 0:
         name = joint_names[beyond.argmax()]
         raise FormatError("the joints", f"{name} {beyond.max():.2g} rad beyond its range", "motions within it")
-    used = np.abs(curve(dense, 1) / velocity_limits).max(), np.sqrt(np.abs(curve(dense, 2)).max() / acceleration)
+    used = np.abs(curve(dense, 1) / robot.velocity_limits).max(), np.sqrt(np.abs(curve(dense, 2)).max() / acceleration)
     return found.slower(max(1.0, *(float(part) * (1 + chosen.margin) for part in used)))
 
 

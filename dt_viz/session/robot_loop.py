@@ -25,7 +25,7 @@ class RoundSettings:
     """Shortest time from one tick of the controller to the next, seconds: 100 Hz."""
     most: int = 5
     """Number of ticks at once, at most: they are longer where the robot's thread is late."""
-    longest: float = 0.4
+    longest: float = 0.25
     """Longest time that the robot moves at once, seconds: a thread that was held up does not make it rush."""
     rest: float = 0.8
     """Time that the robot stays at the goal before it goes home, seconds."""

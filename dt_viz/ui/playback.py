@@ -28,14 +28,12 @@ class PlaybackSettings:
 
     shortest: float = 1 / 20
     """Shortest time from one picture of an arm to the next."""
-    longest: float = 1 / 3
-    """Longest time from one picture to the next, at most `RoundSettings.longest`, or the arm falls behind."""
+    longest: float = 1 / 6
+    """Longest time from one picture to the next: at twice that an obstacle of 0.5 m/s reaches the arm unseen."""
     asleep: float = 0.5
     """Time from one look at whether the page is touched to the next, while the arm waits for that."""
     part: float = 1 / 12
-    """Part of its time that moving and drawing an arm takes, at most."""
-    part_of_all: float = 1 / 3
-    """Part of a process' time that all arms take together, at most: the more visitors, the fewer pictures of each."""
+    """Part of its time that moving and drawing an arm takes: the more visitors there are, the fewer pictures."""
 
 
 class Replay:
@@ -91,8 +89,6 @@ class Playback:
         """What moves now, with its joint angles `q` and `undisturbed`, (n,), rad, and the time since it `arrived`."""
         self.neglected = False
         """Whether nobody has touched the page for a while, and others need the processor: the goal is not left then."""
-        self.num_arms = 1
-        """Number of arms that this process moves."""
         self._draw, self._settings = draw, settings
         self._playing, self._speed = True, 1.0
 
@@ -140,5 +136,4 @@ class Playback:
     def _period(self, taken: float) -> float:
         """Time from one picture to the next where moving and drawing takes so long, seconds."""
         settings = self._settings
-        part = min(settings.part, settings.part_of_all / self.num_arms)
-        return min(max(settings.shortest, taken / part), settings.longest)
+        return min(max(settings.shortest, taken / settings.part), settings.longest)

@@ -134,10 +134,8 @@ class Server:
         """
         self._admit()
         many = len(self.visitors) > (os.cpu_count() or 1)
-        playbacks = {visitor.robot.playback: self.gate.idle(visitor.client) > NEGLECTED for visitor in self.visitors}
-        for playback, untouched in playbacks.items():
-            playback.neglected = many and untouched
-            playback.num_arms = max(1, sum(not other.neglected for other in playbacks))
+        for visitor in self.visitors:
+            visitor.robot.playback.neglected = many and self.gate.idle(visitor.client) > NEGLECTED
         with self._lock:
             for _, said, came in self._waiting.values():
                 if said is not None:

@@ -91,9 +91,11 @@ def test_in_a_lecture_a_quarter_drags_and_one_in_twenty_changes_the_task():
     rest, lecture, all_drag = (
         Namespace(rest=rest, lecture=lecture) for rest, lecture in ((True, False), (False, True), (False, False))
     )
-    roles = [[load.role_of(options, k) for k in range(40)] for options in (rest, lecture, all_drag)]
+    roles = [load.roles_of(options, 40) for options in (rest, lecture, all_drag)]
     assert [sum(role in load.DRAGS for role in each) for each in roles] == [0, 10, 40]
     assert [sum(role.name == "CHANGE_TASK" for role in each) for each in roles] == [0, 2, 0]
+    for turn in (0, 1):  # two processes take visitors in turn
+        assert 2 < sum(role in load.DRAGS for role in roles[1][turn::2]) < 8
 
 
 def test_a_place_that_nobody_asked_for_answers_nothing(visit):

@@ -36,10 +36,9 @@ def unexpected(error):
     pytest.fail(str(error))
 
 
-def playback_of(arm, draw, fail=None, settings=FAST, num_arms=1):
+def playback_of(arm, draw, fail=None, settings=FAST):
     """A playback of such an arm; what keeps it from moving fails the test, unless it is taken."""
     playback, jobs = Playback(cast(Any, arm), draw, settings), Jobs(unexpected)
-    playback.num_arms = num_arms
     playback.begin(jobs, fail or unexpected)
     return playback, jobs
 
@@ -123,8 +122,7 @@ def test_nothing_moves_before_it_begins():
     jobs.close()
 
 
-@pytest.mark.parametrize(("num_arms", "part"), [(1, 1 / 12), (4, 1 / 12), (8, 1 / 24)])
-def test_the_longer_a_picture_takes_and_the_more_arms_there_are_the_fewer_there_are(num_arms, part):
+def test_the_longer_a_picture_takes_the_fewer_there_are():
     begun, enough = [], threading.Event()
 
     def draw():
@@ -133,11 +131,11 @@ def test_the_longer_a_picture_takes_and_the_more_arms_there_are_the_fewer_there_
         if len(begun) > 5:
             enough.set()
 
-    settings = PlaybackSettings(shortest=1e-3, part=1 / 12, part_of_all=1 / 3)
-    _, jobs = playback_of(Arm(), draw, settings=settings, num_arms=num_arms)
+    settings = PlaybackSettings(shortest=1e-3)
+    _, jobs = playback_of(Arm(), draw, settings=settings)
     assert enough.wait(PATIENCE)
     jobs.close()
-    assert np.diff(begun)[1:].min() > 0.9 * 0.005 / part
+    assert np.diff(begun)[1:].min() > 0.9 * 0.005 / settings.part
 
 
 def test_an_arm_never_falls_behind_however_few_pictures_there_are():

@@ -13,8 +13,8 @@ from dt_viz.ui.scene.palette import LIGHT, Theme
 from dt_viz.ui.scene.picture import Lines, Shown
 from dt_viz.ui.scene.style import STYLES
 
-SPACING = 0.08
-"""Distance of the lines on the board, metres, for an arm as large as the JACO."""
+SPACING = 2 / 7
+"""Distance of the lines on the board, relative to half its height."""
 
 
 class Board(Shown):
@@ -36,7 +36,7 @@ class Board(Shown):
         self.plate.visible = area is not None
         if area is not None:
             self.plate.vertices = area.border[:4].astype(np.float32)
-            grid = area.grid(SPACING * area.half_size[1] / 0.28)
+            grid = area.grid(SPACING * area.half_size[1])
             self._lines.show([*grid, *grid.swapaxes(0, 1)], theme)
 
     def ink(self, points: Array, robot: Robot, theme: Theme) -> None:

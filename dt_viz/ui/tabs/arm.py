@@ -85,16 +85,16 @@ def add_joints(gui: viser.GuiApi, bindings: Bindings, send: Callable[[str, bytes
     chosen = Control(gui.add_dropdown("Joints as", tuple(JOINT_FORMATS), hint=hint))
 
     def make(session: Session, step: Step, cancelled: Cancelled) -> tuple[str, bytes]:
-        frame, robot = bindings.frame, session.robot
+        frame = bindings.frame
         if frame is None or frame.arm is None or frame.blocked:
             found = frame.blocked[0].text if frame is not None and frame.blocked else "none that is shown"
             raise FormatError("the arm's motion", found, "one that the arm follows, with “Arm” on in the tab “Show”")
         missed = [warning.text for warning in frame.certificates.warnings if warning.kind is Kind.PATH_MISSED]
         if missed:
             raise FormatError("the arm's motion", missed[0], "one that the arm follows")
-        limits = (robot.lower, robot.upper), robot.velocity_limits, ControllerSettings.acceleration
         with session.engine.refining(cancelled):
-            trajectory = rest_to_rest(robot.joint_names, frame.arm.times, frame.arm.q, *limits)
+            acceleration = ControllerSettings.acceleration
+            trajectory = rest_to_rest(session.robot, frame.arm.times, frame.arm.q, acceleration)
         step(0.5)
         suffix = JOINT_FORMATS[chosen.value]
         return suffix, FORMATS[suffix](trajectory)
