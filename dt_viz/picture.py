@@ -1,7 +1,8 @@
-"""A picture of a scene without a page: a PNG by an installed Chromium, an SVG or a PDF by matplotlib.
+"""A picture of a scene without a page: a PNG by an installed Chromium, an SVG or a PDF, or an HTML page that plays it.
 
 dt-viz picture fig-4 --out fig4.png --size 3840x2160
 dt-viz picture draw_s --out s.svg
+dt-viz picture fig-4 --out fig4.html
 """
 
 from __future__ import annotations
@@ -22,8 +23,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from dt_viz.motion.following import Follower
     from dt_viz.scenario.scenario import Scenario
     from dt_viz.scenario.tasks import Task
+    from dt_viz.session.frame import Frame
 
 BAD_INPUT = 2
 """Exit status for what the user can put right; argparse uses the same."""
@@ -60,7 +63,7 @@ def main(arguments: Sequence[str], prog: str) -> int:
     """Make a picture; returns the process' exit status, or raises SystemExit where argparse does."""
     parser = argparse.ArgumentParser(prog=prog, description=(__doc__ or "").splitlines()[0])
     parser.add_argument("scene", metavar="SCENE", help="a scene, such as fig-4 or its name, or a task")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="a .png, .svg or .pdf")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="a .png, .svg, .pdf or .html")
     parser.add_argument("--size", default="1920x1080", metavar="WxH", help="pixels of a PNG (default: %(default)s)")
     options = parser.parse_args(arguments)
     os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -88,13 +91,16 @@ def _maker(out: Path, size: str) -> Callable[[str, Callable[[Task], Scenario]], 
     from dt_viz.pictures.figures import check_installed  # noqa: PLC0415
     from dt_viz.ui.scene.figure import SUFFIXES  # noqa: PLC0415
 
-    if out.suffix not in (".png", *SUFFIXES):
-        raise FormatError("--out", repr(str(out)), f"a file that ends in {', '.join(('.png', *SUFFIXES))}")
+    suffixes = ".png", *SUFFIXES, ".html"
+    if out.suffix not in suffixes:
+        raise FormatError("--out", repr(str(out)), f"a file that ends in {', '.join(suffixes)}")
     if not out.absolute().parent.is_dir() or out.is_dir():
         raise FormatError("--out", repr(str(out)), "a file in a folder that exists")
     if out.suffix in SUFFIXES:
         check_installed()
         return lambda task, scenario: _drawn(task, scenario, out.suffix)
+    if out.suffix == ".html":
+        return _recorded
     found = re.fullmatch(r"(\d{1,9})x(\d{1,9})", size)
     pixels = tuple(int(number) for number in found.groups()) if found else (0, 0)
     if not SETTINGS.smallest <= min(pixels) <= max(pixels) <= SETTINGS.largest:
@@ -124,19 +130,32 @@ def _chosen(name: str) -> tuple[str, Callable[[Task], Scenario]]:
     return name, initial
 
 
-def _drawn(task: str, scenario: Callable[[Task], Scenario], suffix: str) -> bytes:
-    """Draw a scene as lines and text."""
+def _computed(task: str, scenario: Callable[[Task], Scenario], stage: str) -> tuple[Frame, Follower]:
+    """Compute the frame of a scene at a stage, by its name; return what follows it, too."""
     from dt_viz.folders import default_cache_folder  # noqa: PLC0415
     from dt_viz.learning.store import FitStore  # noqa: PLC0415
     from dt_viz.robot.models import load_jaco  # noqa: PLC0415
     from dt_viz.scenario.tasks import TASKS  # noqa: PLC0415
     from dt_viz.session.engine import Engine  # noqa: PLC0415
-    from dt_viz.session.frame import Stage  # noqa: PLC0415
-    from dt_viz.ui.scene.figure import render_figure  # noqa: PLC0415
 
     engine = Engine(TASKS, FitStore(default_cache_folder()), load_jaco())
     frames = engine.frames(scenario(engine.task(task)))
-    return render_figure(next(frame for frame in frames if frame.stage is Stage.FINE), suffix)
+    return next(frame for frame in frames if frame.stage.name == stage), engine.follower
+
+
+def _drawn(task: str, scenario: Callable[[Task], Scenario], suffix: str) -> bytes:
+    """Draw a scene as lines and text."""
+    from dt_viz.ui.scene.figure import render_figure  # noqa: PLC0415
+
+    frame, _follower = _computed(task, scenario, "FINE")
+    return render_figure(frame, suffix)
+
+
+def _recorded(task: str, scenario: Callable[[Task], Scenario]) -> bytes:
+    """Record a scene as a page that plays it."""
+    from dt_viz.ui.scene.recording import record  # noqa: PLC0415
+
+    return record(*_computed(task, scenario, "CERTIFIED"))
 
 
 def _rendered(task: str, scenario: Callable[[Task], Scenario], size: tuple[int, int], browser: str) -> bytes:

@@ -26,7 +26,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of matp
             ("draw_s", "--out", "nowhere/f.png"),
             "--out: found 'nowhere/f.png'; accepted: a file in a folder that exists",
         ),
-        (("draw_s", "--out", "f.gif"), "--out: found 'f.gif'; accepted: a file that ends in .png, .svg, .pdf"),
+        (("draw_s", "--out", "f.bmp"), "--out: found 'f.bmp'; accepted: a file that ends in .png, .svg, .pdf, .html"),
         (("draw_s", "--out", "."), "--out: found '.'; accepted: a file that ends in"),
     ],
 )

@@ -68,14 +68,15 @@ class ControlPanel:
         preview: Show = lambda _seen, _number: None,
         forget: Callable[[], None] = lambda: None,
         save: Callable[[Session], None] = lambda _session: None,
+        record: Callable[[Step], bytes] = lambda _step: b"",
         open_scenario: Callable[[str, bytes], bool] = lambda _name, _content: False,
         pen: Pen | None = None,
     ) -> None:
         """Build the controls, for the titles of tasks and arms by name; they act once `connect` has given a session.
 
         `render` makes a picture, see `PictureTab`; `send` sends a file whose name ends like this, with a content.
-        `save` sends the scenario as a file and must only submit, `open_scenario` goes on with that of a file if it
-        holds one. A visitor teaches with the `pen`.
+        `save` sends the scenario as a file and must only submit, `record` makes a page that replays what is shown,
+        `open_scenario` goes on with the scenario of a file if it holds one. A visitor teaches with the `pen`.
         """
         self._notify, self._begin_anew, self._titles = notify, (tripod.view, forget), dict(titles)
         self._notified: Message | None = None
@@ -111,8 +112,8 @@ class ControlPanel:
         with tabs.add_tab("Compare"):
             self._compare = ComparePanel(gui, bindings)
         with tabs.add_tab("Picture"):
-            act = {"darken": darken, "enlarge": enlarge, "render": render, "draw": self._draw, "send": send}
-            picture = PictureTab(gui, bindings, tripod, self.presentation, **act)
+            act = {"darken": darken, "enlarge": enlarge, "render": render, "draw": self._draw, "record": record}
+            picture = PictureTab(gui, bindings, tripod, self.presentation, send=send, **act)
         commands = self._commands(gui.main_panel, picture, save, opening)
         add_commands(gui, bindings, commands)
         add_about(gui, commands)

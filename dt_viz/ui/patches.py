@@ -9,8 +9,10 @@ import asyncio
 import functools
 import io
 import socket
+import threading
 from collections.abc import Callable
-from contextlib import redirect_stdout, suppress
+from contextlib import AbstractContextManager, nullcontext, redirect_stdout, suppress
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -161,3 +163,39 @@ def put_back_pose(gizmo: viser.TransformControlsHandle, position: Any, wxyz: Any
     """
     gizmo._impl.position, gizmo._impl.wxyz = np.full(3, np.nan), np.full(4, np.nan)
     gizmo.position, gizmo.wxyz = position, wxyz
+
+
+class Tape(viser.infra.WebsockMessageHandler):
+    """A scene of its own that no browser is connected to: what is drawn in it is recorded.
+
+    Hook: a `SceneApi`, and its serializer, without a server.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        nothing: Any = None  # nobody answers: no loop calls anything back
+        self._unsent = viser.infra._async_message_buffer.AsyncMessageBuffer(nothing, persistent_messages=False)
+        lock = SimpleNamespace(_scene_lifecycle_lock=threading.RLock())
+        owner: Any = SimpleNamespace(_websock_connection=self, _viser_server=lock, client_id="")
+        self._serializer = self.get_message_serializer(lambda message: message.include_in_scene_serialization)
+        self.scene = viser.SceneApi(owner, nothing, nothing)
+        self.camera = viser._viser.InitialCameraConfig(self.queue_message)
+        """Where the camera is at first."""
+
+    def get_message_buffer(self) -> Any:  # noqa: ANN401 - of what is sent, which is nothing
+        return self._unsent
+
+    def queue_message(self, message: Any) -> None:  # noqa: ANN401 - of viser
+        self._serializer._insert_message(message)
+
+    def atomic(self) -> AbstractContextManager[None]:
+        """Do nothing: what is drawn at a moment of the recording is shown together anyway."""
+        return nullcontext()
+
+    def wait(self, seconds: float) -> None:
+        """Let some time of the recording pass."""
+        self._serializer.insert_sleep(seconds)
+
+    def html(self) -> str:
+        """End it; return a page that plays it again and again, with all that it needs."""
+        return self._serializer.as_html()

@@ -13,7 +13,7 @@ import numpy as np
 import viser
 
 from dt_viz.accounts import Account
-from dt_viz.errors import DataError
+from dt_viz.errors import DataError, FormatError
 from dt_viz.files.uploads import keep_ready, let_go
 from dt_viz.obstacles.shapes import Sphere, TriangleObstacle, as_point
 from dt_viz.robot.robot import Robot
@@ -41,9 +41,11 @@ from dt_viz.ui.playback import Playback
 from dt_viz.ui.scene.camera import CameraController, Framing, view_of
 from dt_viz.ui.scene.export import RESOLUTIONS, render_png
 from dt_viz.ui.scene.palette import DARK, LIGHT, Colour, Theme
+from dt_viz.ui.scene.recording import record
 from dt_viz.ui.scene.robot_scene import RobotScene
 from dt_viz.ui.scene.scene import ScenePictures
 from dt_viz.ui.scripts import Link, Ruler
+from dt_viz.ui.tabs.saving import Step
 from dt_viz.warning import Severity
 
 
@@ -119,6 +121,7 @@ class Visitor(Display):
             partial(self._preview, pen),
             self._keeper.forget,
             self._save,
+            self._record,
             self._open,
             pen,
         )
@@ -301,6 +304,13 @@ class Visitor(Display):
         self.client.flush()
         with self.pictures.without_handles(), self.robot.grip.hidden(), self._light():
             return render_png(self.client, size, self._panel.legend, transparent=False, timeout=timeout)
+
+    def _record(self, step: Step) -> bytes:
+        """Make a page that replays what is shown; raises FormatError where that is nothing yet."""
+        frame = self.shown
+        if frame is None:
+            raise FormatError("the scene", "nothing yet", "a scene that is shown")
+        return record(frame, self.session.engines(frame.scenario.arm).follower, self._camera.chosen, step)
 
     def _send(self, suffix: str, content: bytes) -> None:
         self.client.send_file_download(f"{self._name}{suffix}", content, save_immediately=True)

@@ -88,15 +88,24 @@ def test_a_figure_is_saved_of_what_is_shown(saving, frame):
     shown(saving, frame)
     assert saving["Resolution"].visible
     for suffix in SUFFIXES:
-        saving.claim(saving["Format"], suffix[1:].upper())
+        saving.claim(saving["Save as"], suffix[1:].upper())
         assert not [handle for handle in saving.inputs if handle.label == "Resolution" and handle.visible]
         ((name, content),), _ = press(saving, "Save picture")
         assert name == f"dt-viz-draw_s{suffix}"
         assert content.startswith({".svg": b"<?xml", ".pdf": b"%PDF"}[suffix])
-    saving.claim(saving["Format"], "PNG")
+    saving.claim(saving["Save as"], "PNG")
     assert saving["Resolution"].visible
     ((name, content),), _ = press(saving, "Save picture")
     assert name.endswith(".png") and Image.open(io.BytesIO(content)).size == (2, 2)
+
+
+def test_a_page_that_plays_is_saved_of_what_is_shown(saving, frame):
+    shown(saving, frame)
+    saving.claim(saving["Save as"], "HTML")
+    assert not [handle for handle in saving.inputs if handle.label == "Resolution" and handle.visible]
+    ((name, content),), _ = press(saving, "Save picture")
+    saving.claim(saving["Save as"], "PNG")
+    assert name == "dt-viz-draw_s.html" and "__VISER_EMBED_DATA__" in content.decode()
 
 
 def test_a_second_press_cancels_and_the_button_comes_back(saving, frame, monkeypatch):
@@ -111,7 +120,7 @@ def test_a_second_press_cancels_and_the_button_comes_back(saving, frame, monkeyp
 
     monkeypatch.setattr("dt_viz.ui.panel.render_figure", drawn)
     shown(saving, frame)
-    saving.claim(saving["Format"], "SVG")
+    saving.claim(saving["Save as"], "SVG")
     saving.sent.clear()
     button = saving["Save picture"]
     saving.claim(button, True)
@@ -122,7 +131,7 @@ def test_a_second_press_cancels_and_the_button_comes_back(saving, frame, monkeyp
     goes_on.set()
     wait_until(lambda: button.label == "Save picture")
     assert saving.session.jobs.wait_idle("Save picture", 30) and not saving.sent
-    saving.claim(saving["Format"], "PNG")
+    saving.claim(saving["Save as"], "PNG")
 
 
 def texts(svg):

@@ -20,8 +20,8 @@ from dt_viz.ui.tabs.saving import SaveButton, Step
 
 LARGER = 1.4
 """Factor by which the panel, its type and its controls are larger for a projector."""
-PNG = "PNG"
-"""Name of the format that a browser renders; others are drawn here, as lines and text."""
+PNG, HTML = "PNG", "HTML"
+"""Names of the format that a browser renders, and of a page that replays the motion; others are lines and text."""
 ROW = (
     "<style>div:has(> .dt-row) + div > div > :first-child { width: auto !important; }</style><div class='dt-row'></div>"
 )
@@ -58,11 +58,13 @@ class PictureTab:
         enlarge: Callable[[bool], None],
         render: Callable[[str, bool], bytes],
         draw: Callable[[str, Step], bytes],
+        record: Callable[[Step], bytes],
         send: Callable[[str, bytes], None],
     ) -> None:
         """Build the controls where the panel is being built.
 
-        `render` makes a PNG, of a resolution, and perhaps transparent, `draw` a file of lines with a suffix.
+        `render` makes a PNG, of a resolution, and perhaps transparent, `draw` a file of lines with a suffix, `record` a
+        page that replays the motion.
         """
         self._tripod = tripod
         gui.add_html(ROW)
@@ -80,9 +82,12 @@ class PictureTab:
         big = box("Big type", "larger type and controls in a wider panel, to be read from afar")
         self._big = Control(big, enlarge)
         on_press(gui.add_button("Presentation", icon=viser.Icon.PRESENTATION), lambda: presentation.show(True))
-        formats = PNG, *(suffix[1:].upper() for suffix in SUFFIXES)
-        hint = "PNG: the scene as you see it; SVG, PDF: lines and text for a paper, seen from the plane of the task"
-        self._format = Control(gui.add_dropdown("Format", formats, hint=hint), self._choose)
+        formats = PNG, *(suffix[1:].upper() for suffix in SUFFIXES), HTML
+        hint = (
+            "PNG: the scene as you see it; SVG, PDF: lines and text for a paper, seen from the plane of the task; HTML:"
+            " a page that plays the motion, and can be turned, without a server or network"
+        )
+        self._format = Control(gui.add_dropdown("Save as", formats, hint=hint), self._choose)
         self._resolution = Control(gui.add_dropdown("Resolution", tuple(RESOLUTIONS)))
         self._transparent = Control(gui.add_checkbox("Transparent", False))
 
@@ -91,7 +96,7 @@ class PictureTab:
                 return ".png", render(self._resolution.value, self._transparent.value)
             suffix = f".{self._format.value.lower()}"
             with session.engine.refining(cancelled):
-                return suffix, draw(suffix, step)
+                return suffix, record(step) if self._format.value == HTML else draw(suffix, step)
 
         hint = "of the scene, as a file; press again to cancel"
         SaveButton(gui, bindings, "Save picture", make, send, icon=viser.Icon.CAMERA, hint=hint)
