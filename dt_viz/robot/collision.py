@@ -237,17 +237,15 @@ class CollisionModel:
                     distances[row], nearest[row] = distance, item
         return distances, nearest
 
-    def nearest_to_obstacle(self, q: ArrayLike, obstacle: Union | Obstacle) -> Nearest:
+    def nearest_to_obstacle(self, q: ArrayLike, obstacle: Union | Obstacle, below: float = np.inf) -> Nearest:
         """Find the smallest signed distance of the arm from the obstacle on a path q (T, n), rad.
 
         It is accurate to `link_distances.TOLERANCE` for a ball, for other shapes to `SHAPE_TOLERANCE`, inside to
-        `RESOLUTION`.
+        `RESOLUTION`. Only what is `below` a distance is searched for; `NOTHING` where nothing is, which is quick.
         """
         nearest = NOTHING
         for part in obstacle.parts if isinstance(obstacle, Union) else (obstacle,):
-            found = self._search(FromObstacle(self.links, part), q)
-            assert found is not None  # always, without a ceiling
-            nearest = min(nearest, found, key=lambda near: near.distance)
+            nearest = self._search(FromObstacle(self.links, part), q, min(below, nearest.distance)) or nearest
         return nearest
 
     def nearest_to_itself(self, q: ArrayLike) -> Nearest | None:
