@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dt_viz.checkpoints import checkpoint
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.union import Union
@@ -125,6 +126,7 @@ class _Search:
 
     def run(self) -> Nearest | None:
         """Return the smallest distance, up to the measure's tolerance; None if none is below the ceiling."""
+        checkpoint()
         pieces = self._first_pieces()
         while self._best > self._measure.lowest:
             pieces = pieces.take(pieces.lower() < self._best - self._measure.tolerance)

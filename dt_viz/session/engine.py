@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from dt_viz.avoidance.avoidance import Avoidance
+from dt_viz.avoidance.passing import ANEW
 from dt_viz.errors import Cancelled, never
 from dt_viz.learning.augmented import AugmentedImitation
 from dt_viz.learning.imitation import Progress
@@ -28,7 +29,7 @@ from dt_viz.scenario.scenario import Layer, Scenario, Start
 from dt_viz.scenario.tasks import OWN, STYLES, Task, TaskEntry
 from dt_viz.session.certify import certify, clearance, uncertified, with_meshes
 from dt_viz.session.comparison import Comparison
-from dt_viz.session.cores import Cores
+from dt_viz.session.cores import Cores, Rank
 from dt_viz.session.drawing import Drawing, arm_along, rollouts_of
 from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.robot_loop import LiveArm
@@ -110,7 +111,7 @@ class Engine:
 
     def refining(self, cancelled: Cancelled) -> AbstractContextManager[None]:
         """Wait for a core, and have it, as what refines has: whoever drags comes first. Raises as `Cores.slot`."""
-        return _cores.slot(cancelled)
+        return _cores.slot(Rank.REFINEMENT, cancelled)
 
     def frames(
         self,
@@ -142,16 +143,17 @@ class Engine:
         shown = [panel.shown for panel in scenario.view.panels if panel.shown]
         others = {panel: Scenario(panel.task, state=panel.state, arm=scenario.arm) for panel in shown}
         learned = {panel: self.nominal(other, learn).learned for panel, other in others.items()}
-        with _cores.slot():
+        rank = Rank.BEGINNING if scenario.passing is ANEW else Rank.HAND
+        with _cores.slot(rank):
             scenario = newest(scenario)
             frame = self._rollouts(scenario, LIVE)
         yield frame
-        with _cores.slot():
+        with _cores.slot(rank):
             frame = self._seen(frame, Stage.LIVE, learned)
         yield frame
-        with _cores.slot(cancelled):
+        with _cores.slot(Rank.REFINEMENT, cancelled):
             frame = self._rollouts(scenario, FINE)
-        with _cores.slot(cancelled):
+        with _cores.slot(Rank.REFINEMENT, cancelled):
             frame = self._seen(frame, Stage.FINE, learned)
         yield frame
         frame = replace(frame, stage=Stage.CERTIFIED)
@@ -159,7 +161,7 @@ class Engine:
             frame = replace(frame, certificates=self._certified(frame, cancelled))
         yield frame
         if frame.motion.arm is not None and not frame.blocked:
-            with _cores.slot(cancelled):
+            with _cores.slot(Rank.REFINEMENT, cancelled):
                 self.follower.reference_postures(frame.motion.nominal.learned)  # a drag may need them at once
         yield from self._compared_at_rest(frame, cancelled)
 
@@ -313,9 +315,9 @@ class Engine:
 
     @kept(1, by=lambda frame, _: (frame.motion, frame.chosen))
     def _certified(self, frame: Frame, cancelled: Cancelled) -> Certificates:
-        with _cores.slot(cancelled):
+        with _cores.slot(Rank.REFINEMENT, cancelled):
             known = certify(frame, self.follower)
-        with _cores.slot(cancelled):
+        with _cores.slot(Rank.REFINEMENT, cancelled):
             return with_meshes(replace(frame, certificates=known), self.follower.robot)
 
     def _compared(self, frame: Frame, notes: Mapping[str, str] | None = None) -> Frame:
@@ -334,7 +336,7 @@ class Engine:
             return
         left = self.comparison.complete(frame, self._plain(frame.scenario), _cores.giving_way(cancelled))
         while True:
-            with _cores.slot(cancelled):
+            with _cores.slot(Rank.REFINEMENT, cancelled):
                 notes = next(left, None)
                 if notes is None:
                     return

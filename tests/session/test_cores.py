@@ -8,7 +8,7 @@ import pytest
 
 from dt_viz.accounts import Account, QuotaSettings, charged
 from dt_viz.errors import UnwantedError, never
-from dt_viz.session.cores import Cores, CoresSettings
+from dt_viz.session.cores import Cores, CoresSettings, Rank
 
 PATIENCE = 30
 """Seconds after which a test gives up; nothing takes that long."""
@@ -123,7 +123,7 @@ def test_what_waits_and_is_not_wanted_any_more_leaves_at_once_when_it_is_woken()
 
     def want():
         try:
-            with cores.slot(unwanted.is_set):
+            with cores.slot(Rank.REFINEMENT, unwanted.is_set):
                 pass
         except UnwantedError:
             left.set()
@@ -184,7 +184,7 @@ def test_between_parts_who_has_overdrawn_gives_way_while_a_hand_is_followed(acco
     cores, went_on = Cores(2, CoresSettings(longest=0.5)), threading.Event()
 
     def compute():
-        with charged(account), cores.slot(never):
+        with charged(account), cores.slot(Rank.REFINEMENT):
             assert not cores.giving_way(never)()
             went_on.set()
 
@@ -215,7 +215,7 @@ def test_who_has_overdrawn_goes_on_as_soon_as_no_hand_is_followed():
 
 
 def test_a_slot_ends_with_an_exception(crowd):
-    with pytest.raises(ZeroDivisionError), crowd.cores.slot(), crowd.cores.slot(never):
+    with pytest.raises(ZeroDivisionError), crowd.cores.slot(), crowd.cores.slot(Rank.REFINEMENT):
         raise ZeroDivisionError
     crowd.come("A")
     crowd.come("b")
@@ -229,7 +229,7 @@ def test_in_a_storm_no_more_than_the_slots_are_taken_and_all_get_one(num):
 
     def want(refines):
         for _ in range(100):
-            with cores.slot(never if refines else None):
+            with cores.slot(Rank.REFINEMENT if refines else Rank.HAND):
                 for semaphore in (free, *([free_to_refine] if refines else [])):
                     if not semaphore.acquire(blocking=False):
                         crowded.append(threading.current_thread().name)

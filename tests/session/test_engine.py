@@ -11,7 +11,7 @@ from scenes import avoiding, biases, changed, frame_at, kinds, says
 
 import dt_viz.session.engine as engine_module
 from dt_viz.avoidance.bias import MAX_TARGET_MISS, BiasPoint
-from dt_viz.errors import UnwantedError, never
+from dt_viz.errors import UnwantedError
 from dt_viz.flows import rollouts
 from dt_viz.metrics import distance_from_path, maximum_collision_distance
 from dt_viz.motion import diagnostics
@@ -19,7 +19,7 @@ from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import plane_of, switched
 from dt_viz.scenario.tasks import TASKS, TaskEntry, drawing_task
-from dt_viz.session.cores import Cores
+from dt_viz.session.cores import Cores, Rank
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Stage
 from dt_viz.warning import Kind
@@ -277,11 +277,11 @@ def test_a_hand_is_followed_while_all_others_refine(new_engine, initial, monkeyp
     monkeypatch.setattr(engine_module, "_cores", cores)
     frames = new_engine().frames(initial("lift_box"))
     if stage is Stage.LIVE:
-        with cores.slot(never):
+        with cores.slot(Rank.REFINEMENT):
             assert [next(frames).stage, next(frames).stage] == [Stage.ROLLOUTS, Stage.LIVE]
     else:
         assert next(frames).stage is not next(frames).stage
-        with cores.slot(never):
+        with cores.slot(Rank.REFINEMENT):
             refining = threading.Thread(target=lambda: next(frames), daemon=True)
             refining.start()
             refining.join(0.3)
