@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -36,11 +37,14 @@ from dt_viz.session.robot_loop import LiveArm
 from dt_viz.session.tasks_in_reach import where_followed
 from dt_viz.warning import MotionWarning
 
+MOST_BEGINNINGS = 32
+"""Largest number of motions, as tasks and scenes begin, that are kept for all visitors."""
 MOST_OWN = 4
 """Largest number of a visitor's own tasks that are kept; the oldest go first."""
 NOT_TURNED = "the arm does not get there with the hand turned as demonstrated: it follows the places alone"
 """Warning where orientations are left out."""
 
+_Result = TypeVar("_Result")
 _cores = Cores()
 """Slots of all engines."""
 
@@ -158,7 +162,10 @@ class Engine:
         yield frame
         frame = replace(frame, stage=Stage.CERTIFIED)
         if not frame.blocked:
-            frame = replace(frame, certificates=self._certified(frame, cancelled))
+            with _cores.slot(Rank.REFINEMENT, cancelled):
+                frame = replace(frame, certificates=self._certified(frame))
+            with _cores.slot(Rank.REFINEMENT, cancelled):
+                frame = replace(frame, certificates=self._certified_with_meshes(frame))
         yield frame
         if frame.motion.arm is not None and not frame.blocked:
             with _cores.slot(Rank.REFINEMENT, cancelled):
@@ -237,9 +244,15 @@ class Engine:
         full = self._full(scenario, nominal, precision)
         return full if scenario.warp == 1 else self._warped(full, scenario.warp, precision)
 
-    @kept(2, by=lambda scenario, _, precision: (scenario.full, scenario.passing, precision))
     def _full(self, scenario: Scenario, nominal: Nominal, precision: Precision) -> Solved:
-        return solve(scenario.motion, nominal, precision, self.follower)
+        key = scenario.full, scenario.passing, precision
+        return self._kept(scenario, "full", key, lambda: solve(scenario.motion, nominal, precision, self.follower))
+
+    def _kept(self, scenario: Scenario, kind: str, key: Hashable, make: Callable[[], _Result]) -> _Result:
+        """What is kept of a scenario's motions: as tasks and scenes begin, they are the same for all visitors."""
+        shared = scenario.passing is ANEW and scenario.task not in self.own
+        memo, newest = (self._shared, MOST_BEGINNINGS) if shared else (self.memo, 2)
+        return memo(kind, key, make, newest=newest)
 
     @kept(2)
     def _warped(self, full: Solved, fraction: float, precision: Precision) -> Solved:
@@ -313,12 +326,13 @@ class Engine:
             return None, (unreachable(error),)
         return arm, (*warnings, *far_starts(far, nominal.added))
 
-    @kept(1, by=lambda frame, _: (frame.motion, frame.chosen))
-    def _certified(self, frame: Frame, cancelled: Cancelled) -> Certificates:
-        with _cores.slot(Rank.REFINEMENT, cancelled):
-            known = certify(frame, self.follower)
-        with _cores.slot(Rank.REFINEMENT, cancelled):
-            return with_meshes(replace(frame, certificates=known), self.follower.robot)
+    def _certified(self, frame: Frame) -> Certificates:
+        key = frame.motion, frame.chosen
+        return self._kept(frame.scenario, "certified", key, lambda: certify(frame, self.follower))
+
+    def _certified_with_meshes(self, frame: Frame) -> Certificates:
+        key = frame.motion, frame.chosen
+        return self._kept(frame.scenario, "with meshes", key, lambda: with_meshes(frame, self.follower.robot))
 
     def _compared(self, frame: Frame, notes: Mapping[str, str] | None = None) -> Frame:
         """The frame with other methods beside ours, as far as they are known; `notes` see `Comparison.of`."""
