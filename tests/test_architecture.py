@@ -13,7 +13,7 @@ import dt_viz
 
 PACKAGE = Path(dt_viz.__file__).parent
 SOURCES = sorted(PACKAGE.rglob("*.py"))
-FOUNDATION = {"accounts", "errors", "folders", "memo", "metrics", "numerics", "shipped", "warning"}
+FOUNDATION = {"accounts", "checkpoints", "errors", "folders", "memo", "metrics", "numerics", "shipped", "warning"}
 """Modules of no package, which import each other only."""
 BELOW_SCENARIO = {"foundation", "flows", "files", "learning", "obstacles", "robot", "avoidance"}
 BELOW_SESSION = BELOW_SCENARIO | {"scenario", "motion", "control", "pictures"}

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from dt_viz.avoidance.arm_settings import WholeArmSettings
+from dt_viz.checkpoints import checkpoint
 from dt_viz.flows.diffeomorphisms import Diffeomorphism
 from dt_viz.flows.fields import Array, CompiledField
 from dt_viz.kernels import escape
@@ -113,6 +114,7 @@ class WholeArmField(ArmField, CompiledField):
         return self.carried(q, RATE)
 
     def carried(self, s: Array, method: int, duration: float = 0.0, steps: int = 1, tolerance: float = 0.0) -> Array:
+        checkpoint()
         q = np.array(s, order="C")
         if num_failed := escape.carry(self._escape, q, method, float(duration), int(steps), float(tolerance)):
             raise ArithmeticError(f"{num_failed} postures need more than {steps} steps")

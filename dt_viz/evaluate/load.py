@@ -123,9 +123,10 @@ async def _visited(
         before, num_before = used(process), sum(client.num_messages for client in clients)
         began = time.perf_counter()
         roles = roles_of(options, number)
+        beginnings = np.random.default_rng(SETTINGS.seed).random(number)
         doings = (
-            _doing(options, visit, role, places_of(task, k, num_edits))
-            for k, (visit, role) in enumerate(zip(visits, roles, strict=True))
+            _doing(options, visit, role, places_of(task, k, num_edits), first)
+            for k, (visit, role, first) in enumerate(zip(visits, roles, beginnings, strict=True))
         )
         await asyncio.gather(*map(_measured, visits, doings))
         elapsed, after = time.perf_counter() - began, used(process)
@@ -187,13 +188,15 @@ def roles_of(options: argparse.Namespace, number: int) -> list[_Role]:
     return [roles[k] for k in np.random.default_rng(SETTINGS.seed).permutation(number)]
 
 
-def _doing(options: argparse.Namespace, visit: Visit, role: _Role, places: Sequence[Point]) -> Awaitable[None]:
-    """Return what a visitor does in its role, where it drags through places."""
+def _doing(
+    options: argparse.Namespace, visit: Visit, role: _Role, places: Sequence[Point], first: float
+) -> Awaitable[None]:
+    """Return what a visitor does in its role, where it drags through places, from a part of a round on."""
     if role is _Role.DRAG:
         return visit.drag(places)
     if role is _Role.DRAG_IN_BURSTS:
-        return visit.drag_in_bursts(places)
-    return visit.change_task(options.seconds) if role is _Role.CHANGE_TASK else asyncio.sleep(options.seconds)
+        return visit.drag_in_bursts(places, first)
+    return visit.change_task(options.seconds, first) if role is _Role.CHANGE_TASK else asyncio.sleep(options.seconds)
 
 
 async def _measured(visit: Visit, doing: Awaitable[None]) -> None:

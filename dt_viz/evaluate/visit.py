@@ -42,7 +42,7 @@ class LoadSettings:
     changing: float = 1 / 20
     """Part of them that changes the task; the others look on."""
     seed: int = 0
-    """Seed of who does what."""
+    """Seed of who does what in a lecture, and of when each begins."""
     answered: float = 0.5
     """Time within which an edit counts as answered."""
 
@@ -88,17 +88,22 @@ class Visit:
             await self.client.move(place)
         await self.client.release()
 
-    async def drag_in_bursts(self, places: Sequence[Point]) -> None:
-        """Drag the obstacle through some of the places, with pauses, in the time that all of them would take."""
+    async def drag_in_bursts(self, places: Sequence[Point], first: float) -> None:
+        """Drag the obstacle through some of the places, with pauses, in the time that all of them would take.
+
+        The first drag begins after a part of the time from one drag to the next, as nobody is in step with others.
+        """
         size = round(SETTINGS.edits_per_second * SETTINGS.burst)
         step = size + round(SETTINGS.edits_per_second * SETTINGS.pause)
-        for begin in range(0, len(places), step):
+        await asyncio.sleep(first * step / SETTINGS.edits_per_second)
+        for begin in range(round(first * step), len(places), step):
             await self.drag(places[begin : begin + size])
             await asyncio.sleep(SETTINGS.pause)
 
-    async def change_task(self, seconds: float) -> None:
-        """Choose another task again and again, for some seconds."""
+    async def change_task(self, seconds: float, first: float) -> None:
+        """Choose another task again and again, for some seconds, first after a part of a pause."""
         deadline = time.perf_counter() + seconds
+        await asyncio.sleep(first * SETTINGS.pause)
         for number in itertools.count(1):
             titles = self.client.controls[self.client.find("Task")]["options"]
             await self.client.set("Task", titles[number % len(titles)])

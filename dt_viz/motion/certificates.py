@@ -168,7 +168,8 @@ def certified_map(
     moved = np.flatnonzero((y != x).any(axis=1))
     rows = moved if len(moved) else np.arange(len(y))
     keep = rows[np.unique(np.linspace(0, len(rows) - 1, num).astype(int))]
-    images, det = _quicker(transform).forward(y), np.linalg.det(transform.jacobian(y[keep])[1])
+    quicker = _quicker(transform)
+    images, det = quicker.forward(y), np.linalg.det(quicker.jacobian(y[keep])[1])
     off = images - x
     if by_hand:
         # coarse steps there and back are no inverses: then ψ⁻¹, which is what is drawn, is compared and looked at for

@@ -148,9 +148,11 @@ class Follower:
         if not exact:
             return lifted
 
+        robot = self.robot  # what is kept for all visitors must not keep one of them
+
         def exactly(q: Array, index: Indices, fraction: Array) -> Array:
             wanted = nominal.orientations_at(index, fraction)
-            return drawn_onto(self.robot, q, solution.positions_at(index, fraction), reference, wanted)
+            return drawn_onto(robot, q, solution.positions_at(index, fraction), reference, wanted)
 
         return replace(lifted, exactly=exactly)
 

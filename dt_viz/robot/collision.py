@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dt_viz.checkpoints import checkpoint
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.union import Union
@@ -125,6 +126,7 @@ class _Search:
 
     def run(self) -> Nearest | None:
         """Return the smallest distance, up to the measure's tolerance; None if none is below the ceiling."""
+        checkpoint()
         pieces = self._first_pieces()
         while self._best > self._measure.lowest:
             pieces = pieces.take(pieces.lower() < self._best - self._measure.tolerance)
@@ -237,17 +239,15 @@ class CollisionModel:
                     distances[row], nearest[row] = distance, item
         return distances, nearest
 
-    def nearest_to_obstacle(self, q: ArrayLike, obstacle: Union | Obstacle) -> Nearest:
+    def nearest_to_obstacle(self, q: ArrayLike, obstacle: Union | Obstacle, below: float = np.inf) -> Nearest:
         """Find the smallest signed distance of the arm from the obstacle on a path q (T, n), rad.
 
         It is accurate to `link_distances.TOLERANCE` for a ball, for other shapes to `SHAPE_TOLERANCE`, inside to
-        `RESOLUTION`.
+        `RESOLUTION`. Only what is `below` a distance is searched for; `NOTHING` where nothing is, which is quick.
         """
         nearest = NOTHING
         for part in obstacle.parts if isinstance(obstacle, Union) else (obstacle,):
-            found = self._search(FromObstacle(self.links, part), q)
-            assert found is not None  # always, without a ceiling
-            nearest = min(nearest, found, key=lambda near: near.distance)
+            nearest = self._search(FromObstacle(self.links, part), q, min(below, nearest.distance)) or nearest
         return nearest
 
     def nearest_to_itself(self, q: ArrayLike) -> Nearest | None:

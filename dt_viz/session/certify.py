@@ -76,5 +76,5 @@ def with_meshes(frame: Frame, robot: Robot) -> Certificates:
         return known
     places = np.flatnonzero(motion.nominal.shaping).tolist()
     paths = {place: motion.arm.p[motion.arm.index == place] for place in places}
-    nearest = {place: model.nearest_to_obstacle(path, avoidance.avoided) for place, path in paths.items()}
+    nearest = {k: model.nearest_to_obstacle(path, avoidance.avoided, avoidance.margin) for k, path in paths.items()}
     return known.warning(*margin_warnings(scenario, nearest))

@@ -1,4 +1,4 @@
-"""Who computes when: what follows a hand comes before what refines, and in both who owes least comes first."""
+"""Who computes when: what follows a hand comes before all else, and among equals who owes least comes first."""
 
 from __future__ import annotations
 
@@ -8,9 +8,12 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from enum import IntEnum
+from functools import partial
 from typing import NamedTuple
 
 from dt_viz.accounts import settle
+from dt_viz.checkpoints import checked
 from dt_viz.errors import Cancelled, end_if, never
 
 
@@ -23,14 +26,23 @@ class CoresSettings:
     look: float = 0.25
     """Interval at which what waits and may be cancelled asks whether it is still wanted, unless it is woken before."""
     longest: float = 0.25
-    """Longest time for which who has overdrawn gives way at once: he goes on, if slowly."""
+    """Longest time for which who has overdrawn, or refines, gives way at once: he goes on, if slowly."""
+
+
+class Rank(IntEnum):
+    """What a computation is for; the smallest comes first."""
+
+    HAND = 0
+    """It follows a hand: takes a fraction of the time from one picture to the next."""
+    BEGINNING = 1
+    """The first picture of a page, a task or a scene: takes ten times as long."""
+    REFINEMENT = 2
 
 
 class _Place(NamedTuple):
     """A place in the queue; the smallest comes first."""
 
-    refines: bool
-    """Whether it refines, and so follows no hand."""
+    rank: Rank
     debt: float
     """Debt of the account on arrival, seconds; 0 if it is not overdrawn."""
     number: int
@@ -42,10 +54,10 @@ class _Place(NamedTuple):
 class Cores:
     """A bounded semaphore with priorities.
 
-    Those who follow a hand get a slot before those who refine; among equals who owes least, and of these who has waited
-    longest. One slot is never a refinement's, unless there is only one: a hand waits for other hands alone. Nobody
-    waits for a slot within a slot, nor within a `functools.cached_property`: Python 3.10 and 3.11 lock it for all
-    instances.
+    Slots are given by rank; among equals who owes least comes first, and of these who has waited longest. One slot is
+    for hands only, unless there is only one: a hand waits for other hands alone. At each checkpoint a refinement ends
+    if it is cancelled, and pauses while a hand is followed: they would share a processor. Nobody waits
+    for a slot within a slot, nor within a `functools.cached_property`: Python 3.10 and 3.11 lock it for all instances.
     """
 
     def __init__(self, num: int = os.cpu_count() or 1, settings: CoresSettings = CoresSettings()) -> None:
@@ -53,8 +65,8 @@ class Cores:
         self._lock, self._settings = threading.Lock(), settings
         self._left = threading.Condition(self._lock)
         """Notified when somebody gives a slot back."""
-        self._num, self._most = num, {False: settings.num_hands, True: max(1, num - 1)}
-        """Number of slots, and of those of hands and of refinements."""
+        self._num, self._most = num, {True: settings.num_hands, False: max(1, num - 1)}
+        """Number of slots, and of those of hands and of all else."""
         self._numbers = itertools.count()
         self.queue: list[_Place] = []
         """Those who wait; the smallest is next."""
@@ -62,26 +74,29 @@ class Cores:
         """Those who have a slot."""
 
     @contextmanager
-    def slot(self, cancelled: Cancelled | None = None) -> Iterator[None]:
+    def slot(self, rank: Rank = Rank.HAND, cancelled: Cancelled = never) -> Iterator[None]:
         """Wait for a slot, and have it within this block.
 
         Args:
-            cancelled: of a refinement, asked before it begins and while it waits; None for what follows a hand.
+            rank: what it is for.
+            cancelled: asked before it begins, while it waits unless it is for a hand, and of a refinement at each
+                `checkpoint` within the block.
 
         Raises:
-            UnwantedError: it is cancelled.
+            UnwantedError: it is cancelled; a checkpoint raises it, too.
         """
-        end_if(cancelled or never)
-        place = _Place(cancelled is not None, settle(), next(self._numbers), threading.get_ident(), threading.Event())
+        end_if(cancelled)
+        place = _Place(rank, settle(), next(self._numbers), threading.get_ident(), threading.Event())
         with self._lock:
             self.queue.append(place)
             self._admit()
         try:
             while place not in self._held:
-                place.woken.wait(self._settings.look if place.refines else None)
+                place.woken.wait(None if rank is Rank.HAND else self._settings.look)
                 place.woken.clear()
-                end_if(cancelled or never)
-            yield
+                end_if(cancelled)
+            with checked(partial(self._let_hands_go_first, cancelled) if rank is Rank.REFINEMENT else never):
+                yield
         finally:
             settle()
             with self._lock:
@@ -90,10 +105,10 @@ class Cores:
                 self._left.notify_all()
 
     def wake(self, thread: int) -> None:
-        """Have a thread that waits for a slot, to refine, ask at once whether that is still wanted."""
+        """Have a thread that waits for a slot, not for a hand's, ask at once whether that is still wanted."""
         with self._lock:
             for place in self.queue:
-                if place.thread == thread and place.refines:
+                if place.thread == thread and place.rank is not Rank.HAND:
                     place.woken.set()
 
     def give_way(self) -> None:
@@ -112,6 +127,16 @@ class Cores:
 
             self._left.wait_for(is_last, self._settings.longest)
 
+    def _let_hands_go_first(self, cancelled: Cancelled) -> None:
+        """Pause for a while if a hand is followed, or waits. Raises UnwantedError if it is cancelled."""
+        end_if(cancelled)
+        with self._left:
+            self._left.wait_for(
+                lambda: cancelled() or all(place.rank is not Rank.HAND for place in (*self._held, *self.queue)),
+                self._settings.longest,
+            )
+        end_if(cancelled)
+
     def giving_way(self, cancelled: Cancelled) -> Cancelled:
         """Return the same question, which gives way whenever it is asked: between parts of what takes long."""
 
@@ -122,14 +147,13 @@ class Cores:
         return asked
 
     def _admit(self) -> None:
-        """Give slots to those who are next, as far as there are any."""
-        while self.queue:
-            place = min(self.queue)
-            if len(self._held) == self._num or self._num_held(refines=place.refines) == self._most[place.refines]:
+        """Give slots to those who are next, as far as there are any; nothing refines while a hand waits."""
+        for place in sorted(self.queue):
+            hands_wait = any(other.rank is Rank.HAND for other in self.queue)
+            if len(self._held) == self._num or (place.rank is Rank.REFINEMENT and hands_wait):
                 return
-            self.queue.remove(place)
-            self._held.append(place)
-            place.woken.set()
-
-    def _num_held(self, *, refines: bool) -> int:
-        return sum(place.refines == refines for place in self._held)
+            follows = place.rank is Rank.HAND
+            if sum((held.rank is Rank.HAND) == follows for held in self._held) < self._most[follows]:
+                self.queue.remove(place)
+                self._held.append(place)
+                place.woken.set()

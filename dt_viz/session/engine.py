@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
 from dt_viz.avoidance.avoidance import Avoidance
+from dt_viz.avoidance.passing import ANEW
 from dt_viz.errors import Cancelled, never
 from dt_viz.learning.augmented import AugmentedImitation
 from dt_viz.learning.imitation import Progress
@@ -28,18 +30,21 @@ from dt_viz.scenario.scenario import Layer, Scenario, Start
 from dt_viz.scenario.tasks import OWN, STYLES, Task, TaskEntry
 from dt_viz.session.certify import certify, clearance, uncertified, with_meshes
 from dt_viz.session.comparison import Comparison
-from dt_viz.session.cores import Cores
+from dt_viz.session.cores import Cores, Rank
 from dt_viz.session.drawing import Drawing, arm_along, rollouts_of
 from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.robot_loop import LiveArm
 from dt_viz.session.tasks_in_reach import where_followed
 from dt_viz.warning import MotionWarning
 
+MOST_BEGINNINGS = 32
+"""Largest number of motions, as tasks and scenes begin, that are kept for all visitors."""
 MOST_OWN = 4
 """Largest number of a visitor's own tasks that are kept; the oldest go first."""
 NOT_TURNED = "the arm does not get there with the hand turned as demonstrated: it follows the places alone"
 """Warning where orientations are left out."""
 
+_Result = TypeVar("_Result")
 _cores = Cores()
 """Slots of all engines."""
 
@@ -110,7 +115,7 @@ class Engine:
 
     def refining(self, cancelled: Cancelled) -> AbstractContextManager[None]:
         """Wait for a core, and have it, as what refines has: whoever drags comes first. Raises as `Cores.slot`."""
-        return _cores.slot(cancelled)
+        return _cores.slot(Rank.REFINEMENT, cancelled)
 
     def frames(
         self,
@@ -142,24 +147,28 @@ class Engine:
         shown = [panel.shown for panel in scenario.view.panels if panel.shown]
         others = {panel: Scenario(panel.task, state=panel.state, arm=scenario.arm) for panel in shown}
         learned = {panel: self.nominal(other, learn).learned for panel, other in others.items()}
-        with _cores.slot():
+        rank = Rank.BEGINNING if scenario.passing is ANEW else Rank.HAND
+        with _cores.slot(rank):
             scenario = newest(scenario)
             frame = self._rollouts(scenario, LIVE)
         yield frame
-        with _cores.slot():
+        with _cores.slot(rank):
             frame = self._seen(frame, Stage.LIVE, learned)
         yield frame
-        with _cores.slot(cancelled):
+        with _cores.slot(Rank.REFINEMENT, cancelled):
             frame = self._rollouts(scenario, FINE)
-        with _cores.slot(cancelled):
+        with _cores.slot(Rank.REFINEMENT, cancelled):
             frame = self._seen(frame, Stage.FINE, learned)
         yield frame
         frame = replace(frame, stage=Stage.CERTIFIED)
         if not frame.blocked:
-            frame = replace(frame, certificates=self._certified(frame, cancelled))
+            with _cores.slot(Rank.REFINEMENT, cancelled):
+                frame = replace(frame, certificates=self._certified(frame))
+            with _cores.slot(Rank.REFINEMENT, cancelled):
+                frame = replace(frame, certificates=self._certified_with_meshes(frame))
         yield frame
         if frame.motion.arm is not None and not frame.blocked:
-            with _cores.slot(cancelled):
+            with _cores.slot(Rank.REFINEMENT, cancelled):
                 self.follower.reference_postures(frame.motion.nominal.learned)  # a drag may need them at once
         yield from self._compared_at_rest(frame, cancelled)
 
@@ -235,9 +244,15 @@ class Engine:
         full = self._full(scenario, nominal, precision)
         return full if scenario.warp == 1 else self._warped(full, scenario.warp, precision)
 
-    @kept(2, by=lambda scenario, _, precision: (scenario.full, scenario.passing, precision))
     def _full(self, scenario: Scenario, nominal: Nominal, precision: Precision) -> Solved:
-        return solve(scenario.motion, nominal, precision, self.follower)
+        key = scenario.full, scenario.passing, precision
+        return self._kept(scenario, "full", key, lambda: solve(scenario.motion, nominal, precision, self.follower))
+
+    def _kept(self, scenario: Scenario, kind: str, key: Hashable, make: Callable[[], _Result]) -> _Result:
+        """What is kept of a scenario's motions: as tasks and scenes begin, they are the same for all visitors."""
+        shared = scenario.passing is ANEW and scenario.task not in self.own
+        memo, newest = (self._shared, MOST_BEGINNINGS) if shared else (self.memo, 2)
+        return memo(kind, key, make, newest=newest)
 
     @kept(2)
     def _warped(self, full: Solved, fraction: float, precision: Precision) -> Solved:
@@ -311,12 +326,13 @@ class Engine:
             return None, (unreachable(error),)
         return arm, (*warnings, *far_starts(far, nominal.added))
 
-    @kept(1, by=lambda frame, _: (frame.motion, frame.chosen))
-    def _certified(self, frame: Frame, cancelled: Cancelled) -> Certificates:
-        with _cores.slot(cancelled):
-            known = certify(frame, self.follower)
-        with _cores.slot(cancelled):
-            return with_meshes(replace(frame, certificates=known), self.follower.robot)
+    def _certified(self, frame: Frame) -> Certificates:
+        key = frame.motion, frame.chosen
+        return self._kept(frame.scenario, "certified", key, lambda: certify(frame, self.follower))
+
+    def _certified_with_meshes(self, frame: Frame) -> Certificates:
+        key = frame.motion, frame.chosen
+        return self._kept(frame.scenario, "with meshes", key, lambda: with_meshes(frame, self.follower.robot))
 
     def _compared(self, frame: Frame, notes: Mapping[str, str] | None = None) -> Frame:
         """The frame with other methods beside ours, as far as they are known; `notes` see `Comparison.of`."""
@@ -334,7 +350,7 @@ class Engine:
             return
         left = self.comparison.complete(frame, self._plain(frame.scenario), _cores.giving_way(cancelled))
         while True:
-            with _cores.slot(cancelled):
+            with _cores.slot(Rank.REFINEMENT, cancelled):
                 notes = next(left, None)
                 if notes is None:
                     return

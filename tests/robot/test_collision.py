@@ -15,7 +15,8 @@ from laws.registry import TILTED, U_SHAPE, as_solid
 from pinocchio_arm import pinocchio_configuration, pinocchio_model, placed_vertices, random_configurations
 
 from dt_viz.obstacles.shapes import Box, Cylinder, MeshObstacle, Sphere
-from dt_viz.robot.collision import SELF_REACH, CollisionModel, CollisionReport, Nearest
+from dt_viz.obstacles.union import Union
+from dt_viz.robot.collision import NOTHING, SELF_REACH, CollisionModel, CollisionReport, Nearest
 from dt_viz.robot.inverse_kinematics import inverse_kinematics, track
 from dt_viz.robot.link_distances import RESOLUTION, SELF_TOLERANCE, SHAPE_TOLERANCE, TOLERANCE
 from dt_viz.robot.meshes import LinkMesh
@@ -189,6 +190,17 @@ class TestBetweenSamples:
         assert found.links == (model.links[nearest[0]].name,)
         larger = model.nearest_to_obstacle(q, Sphere(ball.position, diameter + growth)).distance
         np.testing.assert_allclose(found.distance - larger, growth / 2, atol=2 * TOLERANCE)
+
+    @settings(max_examples=15)
+    @given(seed=seeds, share=st.floats(0.0, 1.0), others=st.integers(0, 2))
+    def test_only_what_is_below_a_distance_is_found_and_of_several_obstacles_the_nearest(self, seed, share, others):
+        model, q = load_jaco().collision, random_path(seed)
+        places = model.robot.forward_kinematics(q[len(q) // 2])[1][seed % 3 :]
+        balls = [Sphere(tuple(place + np.array([0.1, 0.0, 0.05])), 0.1) for place in places[: 1 + others]]
+        nearest = min((model.nearest_to_obstacle(q, ball) for ball in balls), key=lambda near: near.distance)
+        found = model.nearest_to_obstacle(q, Union(tuple(balls)), nearest.distance + 1e-3 + 0.2 * share)
+        np.testing.assert_allclose(found.distance, nearest.distance, atol=2 * TOLERANCE)
+        assert model.nearest_to_obstacle(q, Union(tuple(balls)), nearest.distance - 1e-3 - 0.2 * share) is NOTHING
 
     def test_reach_bounds_the_distance_from_the_axes(self, model):
         largest = np.zeros_like(model.reach)

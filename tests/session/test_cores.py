@@ -7,8 +7,9 @@ from time import thread_time
 import pytest
 
 from dt_viz.accounts import Account, QuotaSettings, charged
+from dt_viz.checkpoints import checkpoint
 from dt_viz.errors import UnwantedError, never
-from dt_viz.session.cores import Cores, CoresSettings
+from dt_viz.session.cores import Cores, CoresSettings, Rank
 
 PATIENCE = 30
 """Seconds after which a test gives up; nothing takes that long."""
@@ -123,7 +124,7 @@ def test_what_waits_and_is_not_wanted_any_more_leaves_at_once_when_it_is_woken()
 
     def want():
         try:
-            with cores.slot(unwanted.is_set):
+            with cores.slot(Rank.REFINEMENT, unwanted.is_set):
                 pass
         except UnwantedError:
             left.set()
@@ -184,7 +185,7 @@ def test_between_parts_who_has_overdrawn_gives_way_while_a_hand_is_followed(acco
     cores, went_on = Cores(2, CoresSettings(longest=0.5)), threading.Event()
 
     def compute():
-        with charged(account), cores.slot(never):
+        with charged(account), cores.slot(Rank.REFINEMENT):
             assert not cores.giving_way(never)()
             went_on.set()
 
@@ -215,7 +216,7 @@ def test_who_has_overdrawn_goes_on_as_soon_as_no_hand_is_followed():
 
 
 def test_a_slot_ends_with_an_exception(crowd):
-    with pytest.raises(ZeroDivisionError), crowd.cores.slot(), crowd.cores.slot(never):
+    with pytest.raises(ZeroDivisionError), crowd.cores.slot(), crowd.cores.slot(Rank.REFINEMENT):
         raise ZeroDivisionError
     crowd.come("A")
     crowd.come("b")
@@ -229,7 +230,7 @@ def test_in_a_storm_no_more_than_the_slots_are_taken_and_all_get_one(num):
 
     def want(refines):
         for _ in range(100):
-            with cores.slot(never if refines else None):
+            with cores.slot(Rank.REFINEMENT if refines else Rank.HAND):
                 for semaphore in (free, *([free_to_refine] if refines else [])):
                     if not semaphore.acquire(blocking=False):
                         crowded.append(threading.current_thread().name)
@@ -246,3 +247,53 @@ def test_in_a_storm_no_more_than_the_slots_are_taken_and_all_get_one(num):
         thread.join(PATIENCE)
         assert not thread.is_alive()
     assert crowded == []
+
+
+@pytest.mark.parametrize("rank", [Rank.REFINEMENT, Rank.BEGINNING])
+def test_at_a_checkpoint_a_refinement_pauses_while_a_hand_is_followed_and_a_beginning_does_not(rank):
+    cores, went_on = Cores(2, CoresSettings(longest=PATIENCE)), threading.Event()
+
+    def compute():
+        with cores.slot(rank):
+            checkpoint()
+            went_on.set()
+
+    thread = threading.Thread(target=compute)
+    with cores.slot():
+        thread.start()
+        assert went_on.wait(0.3) == (rank is Rank.BEGINNING)
+    assert went_on.wait(PATIENCE / 3)
+    thread.join(PATIENCE)
+    checkpoint()  # without a slot it asks nobody
+
+
+def test_a_beginning_waits_for_one_slot_only_while_hands_wait_for_theirs():
+    cores = Cores(2)
+    began = threading.Event()
+
+    def begin():
+        with cores.slot(Rank.BEGINNING):
+            began.set()
+
+    def follow():
+        with cores.slot():
+            pass
+
+    with cores.slot():
+        others = [threading.Thread(target=follow), threading.Thread(target=begin)]
+        others[0].start()
+        while not cores.queue:
+            threading.Event().wait(0.001)
+        others[1].start()
+        assert began.wait(PATIENCE)
+    for thread in others:
+        thread.join(PATIENCE)
+
+
+def test_a_refinement_that_is_cancelled_ends_at_its_next_checkpoint():
+    cores, unwanted = Cores(2), threading.Event()
+    with pytest.raises(UnwantedError), cores.slot(Rank.REFINEMENT, unwanted.is_set):
+        checkpoint()
+        unwanted.set()
+        checkpoint()
+        pytest.fail("it went on")

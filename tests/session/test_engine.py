@@ -1,7 +1,9 @@
 """Scenario to frames, for the tasks that ship: what a picture promises, whatever the scenario."""
 
+import gc
 import itertools
 import threading
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -11,15 +13,17 @@ from scenes import avoiding, biases, changed, frame_at, kinds, says
 
 import dt_viz.session.engine as engine_module
 from dt_viz.avoidance.bias import MAX_TARGET_MISS, BiasPoint
-from dt_viz.errors import UnwantedError, never
+from dt_viz.avoidance.passing import ANEW
+from dt_viz.errors import UnwantedError
 from dt_viz.flows import rollouts
+from dt_viz.memo import Memo
 from dt_viz.metrics import distance_from_path, maximum_collision_distance
 from dt_viz.motion import diagnostics
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import plane_of, switched
 from dt_viz.scenario.tasks import TASKS, TaskEntry, drawing_task
-from dt_viz.session.cores import Cores
+from dt_viz.session.cores import Cores, Rank
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Stage
 from dt_viz.warning import Kind
@@ -28,6 +32,7 @@ PATIENCE = 60
 """Seconds after which threads that should have ended are given up; nothing takes that long."""
 TASK_NAMES = ["draw_s", "lift_box"]
 MARGIN_KEPT = 0.9
+NUM_MOMENTS = 12
 
 
 @pytest.fixture(params=TASK_NAMES, name="scenario")
@@ -254,21 +259,22 @@ def test_a_motion_that_would_take_too_many_samples_says_so(new_engine, initial, 
 def test_wherever_refining_is_cancelled_it_leaves_nothing_half_done(fits, robot, space):
     (demonstration, *_), passed = TASKS["draw_s"]().demonstrations, []
     one = TaskEntry("One", lambda: drawing_task("one", "One", "", (demonstration,)))
-    undisturbed, engine = (Engine({"one": one}, fits, robot) for _ in range(2))
+    undisturbed = Engine({"one": one}, fits, robot)
     scenario = avoiding("one", Sphere(one().obstacle_position), space=space)
     *_, expected = undisturbed.frames(scenario, cancelled=lambda: passed.append(None) is not None)
     assert len(passed) >= len(Stage)
-    for moment in range(len(passed)):
+    for moment in np.linspace(0, len(passed) - 1, NUM_MOMENTS).astype(int):
         left, stages = iter(range(moment)), []
+        engine = Engine({"one": one}, fits, robot)
         with pytest.raises(UnwantedError):
             for frame in engine.frames(scenario, cancelled=lambda left=left: next(left, None) is None):
                 stages.append(frame.stage)
         assert stages[:2] == [Stage.ROLLOUTS, Stage.LIVE]  # what follows a hand comes first, and whole
-    *_, found = engine.frames(scenario)
-    for path, times, same, at in zip(found.rollouts, found.times, expected.rollouts, expected.times, strict=True):
-        np.testing.assert_allclose(path, same, rtol=0, atol=1e-9)
-        np.testing.assert_allclose(times, at, rtol=0, atol=1e-9)
-    assert (found.certificates, found.durations) == (expected.certificates, expected.durations)
+        *_, found = engine.frames(scenario)
+        for path, times, same, at in zip(found.rollouts, found.times, expected.rollouts, expected.times, strict=True):
+            np.testing.assert_allclose(path, same, rtol=0, atol=1e-9)
+            np.testing.assert_allclose(times, at, rtol=0, atol=1e-9)
+        assert (found.certificates, found.durations) == (expected.certificates, expected.durations)
 
 
 @pytest.mark.parametrize("stage", [Stage.LIVE, Stage.FINE])
@@ -277,11 +283,11 @@ def test_a_hand_is_followed_while_all_others_refine(new_engine, initial, monkeyp
     monkeypatch.setattr(engine_module, "_cores", cores)
     frames = new_engine().frames(initial("lift_box"))
     if stage is Stage.LIVE:
-        with cores.slot(never):
+        with cores.slot(Rank.REFINEMENT):
             assert [next(frames).stage, next(frames).stage] == [Stage.ROLLOUTS, Stage.LIVE]
     else:
         assert next(frames).stage is not next(frames).stage
-        with cores.slot(never):
+        with cores.slot(Rank.REFINEMENT):
             refining = threading.Thread(target=lambda: next(frames), daemon=True)
             refining.start()
             refining.join(0.3)
@@ -307,6 +313,47 @@ def test_refining_that_is_not_wanted_any_more_does_not_wait_for_its_slot(new_eng
         assert not ended.wait(0.1)
         unwanted.set()
         assert ended.wait(PATIENCE)
+
+
+@pytest.mark.parametrize(("passing", "rank"), [(ANEW, Rank.BEGINNING), (None, Rank.HAND)])
+def test_the_first_picture_of_a_task_takes_no_slot_of_a_hand(new_engine, initial, monkeypatch, passing, rank):
+    cores, taken = Cores(2), []
+    slot = cores.slot
+    monkeypatch.setattr(engine_module, "_cores", cores)
+    monkeypatch.setattr(cores, "slot", lambda rank=Rank.HAND, *more: (taken.append(rank), slot(rank, *more))[1])
+    frame_at(new_engine(), replace(initial("draw_s"), passing=passing), Stage.LIVE)
+    assert taken == [rank, rank]
+
+
+def test_what_refines_ends_between_its_parts_when_it_is_not_wanted_any_more(new_engine, initial):
+    asked = []
+
+    def cancelled():
+        asked.append(True)
+        return len(asked) > 10  # the slot asks twice
+
+    scenario = changed(initial("draw_s"), space="cspace")
+    frames = new_engine().frames(scenario, cancelled=cancelled)
+    assert [next(frames).stage, next(frames).stage] == [Stage.ROLLOUTS, Stage.LIVE]
+    with pytest.raises(UnwantedError):
+        next(frames)
+
+
+def test_as_a_task_begins_it_is_computed_once_for_all_visitors_who_are_not_kept_by_it(fits, robot, initial):
+    shared, scenario, last = Memo(), replace(changed(initial("draw_s"), space="cspace"), passing=ANEW), Stage.CERTIFIED
+    first, second, other = (Engine(TASKS, fits, robot, shared) for _ in range(3))
+    one, same = frame_at(first, scenario, last), frame_at(second, scenario, last)
+    assert same.motion is one.motion and same.certificates == one.certificates
+    dragged = placed(scenario, np.add(scenario.obstacles[0].position, 0.01), passing=one.passing)
+    assert frame_at(first, dragged, last).motion is not frame_at(second, dragged, last).motion
+    left = weakref.ref(first.follower)
+    del first, one
+    gc.collect()
+    assert left() is None
+    own = [engine.bring(engine.task(task), "draw_s")[0] for engine, task in ((second, "draw_c"), (other, "draw_z"))]
+    assert own[0].name == own[1].name
+    seen = [frame_at(engine, replace(scenario, task=own[0].name), Stage.LIVE) for engine in (second, other)]
+    assert not np.array_equal(*(frame.rollouts[0] for frame in seen))
 
 
 def test_who_learns_or_compares_gives_way_between_parts(new_engine, initial, monkeypatch):
