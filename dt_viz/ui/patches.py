@@ -10,8 +10,8 @@ import functools
 import io
 import socket
 import threading
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext, redirect_stdout, suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stdout, suppress
 from types import SimpleNamespace
 from typing import Any
 
@@ -183,14 +183,17 @@ class Tape(viser.infra.WebsockMessageHandler):
         """Where the camera is at first."""
 
     def get_message_buffer(self) -> Any:  # noqa: ANN401 - of what is sent, which is nothing
+        """Return where messages wait that are to be sent, which none are."""
         return self._unsent
 
     def queue_message(self, message: Any) -> None:  # noqa: ANN401 - of viser
+        """Record a message of the scene."""
         self._serializer._insert_message(message)
 
-    def atomic(self) -> AbstractContextManager[None]:
+    @contextmanager
+    def atomic(self) -> Iterator[None]:
         """Do nothing: what is drawn at a moment of the recording is shown together anyway."""
-        return nullcontext()
+        yield
 
     def wait(self, seconds: float) -> None:
         """Let some time of the recording pass."""

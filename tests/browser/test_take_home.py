@@ -32,7 +32,7 @@ def test_a_page_plays_without_server_and_network(browser, tmp_path, cache, monke
     moment = page.locator("input[inputmode]").first
 
     def seen(part):
-        """The scene at a part of its duration, paused there."""
+        """The scene soon after a part of its duration."""
         close_notices(page)
         bar = page.locator(".mantine-Slider-track").bounding_box()
         page.mouse.click(bar["x"] + part * bar["width"], bar["y"] + bar["height"] / 2)
@@ -42,11 +42,10 @@ def test_a_page_plays_without_server_and_network(browser, tmp_path, cache, monke
 
     began = moment.input_value()
     wait_until(lambda: moment.input_value() != began, "the motion to go on")  # it plays by itself
-    first, middle, again = seen(0.05), seen(0.5), seen(0.05)
+    first, middle = seen(0.05), seen(0.5)
     assert first.std() > 10
     changed = np.abs(middle - first).max(axis=2) > 40
     assert changed.sum() > 300
-    assert (np.abs(again - first).max(axis=2) > 40).sum() < changed.sum() / 10
     assert not complaints
     assert {url for url in asked if not url.startswith(("data:", "blob:"))} == {file.as_uri()}
     context.close()

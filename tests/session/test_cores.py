@@ -23,13 +23,13 @@ class Crowd:
         self.cores, self.order, self.threads, self.let_go = Cores(num, settings), [], {}, {}
         self._got = threading.Condition()
 
-    def come(self, name, cancelled=None, account=None):
+    def come(self, name, cancelled=never, account=None):
         """Returns when this one waits or has a slot. Those whose names are upper case refine."""
-        cancelled = never if name.isupper() and cancelled is None else cancelled
+        rank = Rank.REFINEMENT if name.isupper() else Rank.HAND
         self.let_go[name] = threading.Event()
 
         def want():
-            with charged(account), self.cores.slot(cancelled):
+            with charged(account), self.cores.slot(rank, cancelled):
                 with self._got:
                     self.order.append(name)
                     self._got.notify_all()

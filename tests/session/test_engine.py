@@ -353,7 +353,7 @@ def test_as_a_task_begins_it_is_computed_once_for_all_visitors_who_are_not_kept_
     own = [engine.bring(engine.task(task), "draw_s")[0] for engine, task in ((second, "draw_c"), (other, "draw_z"))]
     assert own[0].name == own[1].name
     seen = [frame_at(engine, replace(scenario, task=own[0].name), Stage.LIVE) for engine in (second, other)]
-    assert not np.array_equal(*(frame.rollouts[0] for frame in seen))
+    assert not np.array_equal(seen[0].rollouts[0], seen[1].rollouts[0])
 
 
 def test_who_learns_or_compares_gives_way_between_parts(new_engine, initial, monkeypatch):

@@ -33,7 +33,9 @@ def page(frame, engine):
 
 def recorded(page):
     """Duration, seconds, and messages with their times, of a page."""
-    data = base64.b64decode(re.search(rb'__VISER_EMBED_DATA__="([^"]+)"', page)[1])
+    found = re.search(rb'__VISER_EMBED_DATA__="([^"]+)"', page)
+    assert found is not None
+    data = base64.b64decode(found[1])
     size = int.from_bytes(data[:8], "little")
     inner = zstandard.ZstdDecompressor().decompress(data[8:], max_output_size=size)
     length = int.from_bytes(inner[:8], "little")
