@@ -102,6 +102,20 @@ class TestDrawing:
         assert np.linalg.norm(ink.mean(axis=1)[:, None] - inside, axis=2).min() > INK_STEP
         assert np.linalg.norm(ink[:, 1] - ink[:, 0], axis=1).max() < 3 * INK_STEP
 
+    def test_the_board_may_be_wiped_while_the_pen_draws(self, carrying, monkeypatch):
+        path, norm = DRAW.paths[0], np.linalg.norm
+        self.drawn(carrying, path[:5])
+
+        def wiping(*vectors, **how):
+            carrying.stand(DROP)
+            carrying.stand(DRAW)
+            return norm(*vectors, **how)
+
+        monkeypatch.setattr(np.linalg, "norm", wiping)
+        pose(carrying, path[20], 0.0, 10.0)
+        monkeypatch.undo()
+        assert len(self.drawn(carrying, path, begin=20.0)) > len(path) / 3
+
     def test_the_board_is_wiped_when_the_hand_sets_out_again(self, carrying):
         path = DRAW.paths[0]
         whole = len(self.drawn(carrying, path))

@@ -81,14 +81,15 @@ class Drawing:
             self._wipe()
         place = hand.place
         touches = hand.arrived == 0 and abs(float((place - self._area.centre) @ self._area.normal)) < TOUCHES
-        if touches and not self._touched:
-            self._strokes.append([place])
-        elif touches and np.linalg.norm(place - self._strokes[-1][-1]) > INK_STEP:
-            self._strokes[-1].append(place)
+        strokes = self._strokes  # another thread may wipe the board meanwhile
+        if touches and not (self._touched and strokes):
+            strokes.append([place])
+        elif touches and np.linalg.norm(place - strokes[-1][-1]) > INK_STEP:
+            strokes[-1].append(place)
         self._touched = touches
         if moment - self._drawn > INK_PERIOD and touches:
             self._drawn = moment
-            self.ink.show([np.array(stroke) for stroke in self._strokes if len(stroke) > 1], theme)
+            self.ink.show([np.array(stroke) for stroke in strokes if len(stroke) > 1], theme)
 
     def _wipe(self) -> None:
         self._strokes, self._touched = [], False
