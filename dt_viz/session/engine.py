@@ -23,6 +23,7 @@ from dt_viz.motion.nominal import Learned, Nominal, NominalTrajectory
 from dt_viz.motion.profiles import profiles
 from dt_viz.motion.solve import Solved, solve, warped
 from dt_viz.motion.stack import FINE, LIVE, Precision
+from dt_viz.obstacles.shapes import TriangleObstacle
 from dt_viz.robot.inverse_kinematics import UnreachableError
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.panels import Panel
@@ -249,8 +250,12 @@ class Engine:
         return self._kept(scenario, "full", key, lambda: solve(scenario.motion, nominal, precision, self.follower))
 
     def _kept(self, scenario: Scenario, kind: str, key: Hashable, make: Callable[[], _Result]) -> _Result:
-        """What is kept of a scenario's motions: as tasks and scenes begin, they are the same for all visitors."""
-        shared = scenario.passing is ANEW and scenario.task not in self.own
+        """What is kept of a scenario's motions: as tasks and scenes begin, they are the same for all visitors.
+
+        What only one of them has, which may be large, goes with him.
+        """
+        owns = scenario.task in self.own or any(isinstance(shape, TriangleObstacle) for shape in scenario.obstacles)
+        shared = scenario.passing is ANEW and not owns
         memo, newest = (self._shared, MOST_BEGINNINGS) if shared else (self.memo, 2)
         return memo(kind, key, make, newest=newest)
 

@@ -19,7 +19,8 @@ from dt_viz.flows import rollouts
 from dt_viz.memo import Memo
 from dt_viz.metrics import distance_from_path, maximum_collision_distance
 from dt_viz.motion import diagnostics
-from dt_viz.obstacles.shapes import Sphere, as_point
+from dt_viz.obstacles.shapes import MeshObstacle, Sphere, as_point
+from dt_viz.obstacles.solids import Solid
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import plane_of, switched
 from dt_viz.scenario.tasks import TASKS, TaskEntry, drawing_task
@@ -346,6 +347,9 @@ def test_as_a_task_begins_it_is_computed_once_for_all_visitors_who_are_not_kept_
     assert same.motion is one.motion and same.certificates == one.certificates
     dragged = placed(scenario, np.add(scenario.obstacles[0].position, 0.01), passing=one.passing)
     assert frame_at(first, dragged, last).motion is not frame_at(second, dragged, last).motion
+    (ball,) = scenario.obstacles
+    mesh = changed(scenario, obstacles=(MeshObstacle(ball.position, Solid(*ball.surface())),))
+    assert frame_at(first, mesh, Stage.LIVE).motion is not frame_at(second, mesh, Stage.LIVE).motion
     left = weakref.ref(first.follower)
     del first, one
     gc.collect()
