@@ -41,7 +41,10 @@ def test_an_s_is_drawn_with_the_mouse_and_learned_and_escape_leaves(tab, robot):
     fine = np.stack([np.interp(np.linspace(0, 1, 300), U, x) for x in places.T], axis=1)
     assert np.linalg.norm(drawn[:, None] - fine, axis=-1).min(axis=1).max() < 0.04  # a page that is busy skips moves
     assert len(drawn) > 50  # dots
-    press(page.get_by_role("button", name="Learn", exact=True))
+    learn = page.get_by_role("button", name="Learn", exact=True)
+    wait_until(learn.is_enabled, "the take's check")
+    until_drawn(visitor)
+    press(learn)
     wait_until(lambda: visitor.shown is not None and visitor.shown.task.title == "Your data", "the learned motion")
     visitor.session.edit("test", view=replace(LIGHT, rollouts=True))
     assert visitor.session.wait_idle(PATIENCE)
