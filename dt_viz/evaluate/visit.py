@@ -113,8 +113,8 @@ class Visit:
 
     @property
     def last_shown(self) -> bool:
-        """Whether the last edit is answered."""
-        return bool(self.seen) and self.seen[-1][0] == len(self.sent) - 1
+        """Whether the last edit, if there is one, is answered."""
+        return (self.seen[-1][0] if self.seen else -1) == len(self.sent) - 1
 
     @property
     def answered(self) -> float | None:

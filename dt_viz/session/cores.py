@@ -56,8 +56,8 @@ class Cores:
 
     Slots are given by rank; among equals who owes least comes first, and of these who has waited longest. One slot is
     for hands only, unless there is only one: a hand waits for other hands alone. At each checkpoint a refinement ends
-    if it is cancelled, and pauses while a hand is followed: they would share a processor. Nobody waits
-    for a slot within a slot, nor within a `functools.cached_property`: Python 3.10 and 3.11 lock it for all instances.
+    if it is cancelled, and pauses while another slot follows a hand: they would share a processor. Nobody waits for a
+    slot within a slot, nor within a `functools.cached_property`: Python 3.10 and 3.11 lock it for all instances.
     """
 
     def __init__(self, num: int = os.cpu_count() or 1, settings: CoresSettings = CoresSettings()) -> None:
@@ -128,12 +128,13 @@ class Cores:
             self._left.wait_for(is_last, self._settings.longest)
 
     def _let_hands_go_first(self, cancelled: Cancelled) -> None:
-        """Pause for a while if a hand is followed, or waits. Raises UnwantedError if it is cancelled."""
-        end_if(cancelled)
+        """Pause for a while if another slot follows a hand. Raises UnwantedError if it is cancelled.
+
+        A hand that waits is no reason: with a single slot it waits for this refinement.
+        """
         with self._left:
             self._left.wait_for(
-                lambda: cancelled() or all(place.rank is not Rank.HAND for place in (*self._held, *self.queue)),
-                self._settings.longest,
+                lambda: cancelled() or all(place.rank is not Rank.HAND for place in self._held), self._settings.longest
             )
         end_if(cancelled)
 

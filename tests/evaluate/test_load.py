@@ -1,5 +1,6 @@
 """Visitors at once, without browsers, and the measurement that opens the page and drags in it."""
 
+import asyncio
 import json
 import socket
 from argparse import Namespace
@@ -96,6 +97,24 @@ def test_in_a_lecture_a_quarter_drags_and_one_in_twenty_changes_the_task():
     assert [sum(role.name == "CHANGE_TASK" for role in each) for each in roles] == [0, 2, 0]
     for turn in (0, 1):  # two processes take visitors in turn
         assert 2 < sum(role in load.DRAGS for role in roles[1][turn::2]) < 8
+
+
+@pytest.mark.anyio
+async def test_who_has_dragged_nothing_waits_for_no_picture_and_drags_begin_out_of_step(visit, monkeypatch):
+    assert Visit(visit.client).last_shown
+    begun = []
+
+    async def drag(self, places):
+        begun.append(places)
+
+    async def sleep(seconds):
+        begun.append(seconds)
+
+    monkeypatch.setattr(Visit, "drag", drag)
+    monkeypatch.setattr(asyncio, "sleep", sleep)
+    await visit.drag_in_bursts([(float(k), 0.0, 0.0) for k in range(200)], 0.5)
+    waited, first, pause, second, _ = begun
+    assert (waited, first[0][0], len(first), pause, second[0][0], len(second)) == (3.0, 60, 40, SETTINGS.pause, 180, 20)
 
 
 def test_a_place_that_nobody_asked_for_answers_nothing(visit):

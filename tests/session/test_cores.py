@@ -290,6 +290,33 @@ def test_a_beginning_waits_for_one_slot_only_while_hands_wait_for_theirs():
         thread.join(PATIENCE)
 
 
+def test_a_refinement_does_not_pause_for_a_hand_that_waits_for_its_slot():
+    cores, hand_waits, went_on = Cores(1, CoresSettings(longest=PATIENCE)), threading.Event(), threading.Event()
+
+    def refine():
+        with cores.slot(Rank.REFINEMENT):
+            hand_waits.wait(PATIENCE)
+            checkpoint()
+            went_on.set()
+
+    def follow():
+        with cores.slot():
+            pass
+
+    threads = [threading.Thread(target=work) for work in (refine, follow)]
+    threads[0].start()
+    while not cores._held:
+        threading.Event().wait(0.001)
+    threads[1].start()
+    while not cores.queue:
+        threading.Event().wait(0.001)
+    hand_waits.set()
+    assert went_on.wait(PATIENCE / 3)
+    for thread in threads:
+        thread.join(PATIENCE)
+        assert not thread.is_alive()
+
+
 def test_a_refinement_that_is_cancelled_ends_at_its_next_checkpoint():
     cores, unwanted = Cores(2), threading.Event()
     with pytest.raises(UnwantedError), cores.slot(Rank.REFINEMENT, unwanted.is_set):

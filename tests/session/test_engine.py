@@ -341,13 +341,14 @@ def test_what_refines_ends_between_its_parts_when_it_is_not_wanted_any_more(new_
 
 
 def test_as_a_task_begins_it_is_computed_once_for_all_visitors_who_are_not_kept_by_it(fits, robot, initial):
-    shared, scenario, last = Memo(), replace(changed(initial("draw_s"), space="cspace"), passing=ANEW), Stage.CERTIFIED
+    shared, last, ball = Memo(), Stage.CERTIFIED, initial("draw_s").obstacles[0]
+    layers = biases(BiasPoint(as_point(np.add(ball.position, (0.1, 0.0, 0.1)))))
+    scenario = replace(changed(initial("draw_s"), space="cspace", layers=layers), passing=ANEW)
     first, second, other = (Engine(TASKS, fits, robot, shared) for _ in range(3))
     one, same = frame_at(first, scenario, last), frame_at(second, scenario, last)
     assert same.motion is one.motion and same.certificates == one.certificates
-    dragged = placed(scenario, np.add(scenario.obstacles[0].position, 0.01), passing=one.passing)
+    dragged = placed(scenario, np.add(ball.position, 0.01), passing=one.passing)
     assert frame_at(first, dragged, last).motion is not frame_at(second, dragged, last).motion
-    (ball,) = scenario.obstacles
     mesh = changed(scenario, obstacles=(MeshObstacle(ball.position, Solid(*ball.surface())),))
     assert frame_at(first, mesh, Stage.LIVE).motion is not frame_at(second, mesh, Stage.LIVE).motion
     left = weakref.ref(first.follower)
