@@ -79,6 +79,7 @@ class ScenePictures:
             Obstacles(scene, session), BiasPoints(scene, session), MovableSlice(scene, session), Starts(scene, session)
         )
         self._always: tuple[Picture, ...] = (*self.markers, LevelRollouts(scene), Goal(scene))
+        self.compared = ComparedMotions(scene)
         self._by_view: dict[str, Picture] = {
             "demonstrations": demonstrations(scene),
             "rollouts": Rollouts(scene),
@@ -90,7 +91,7 @@ class ScenePictures:
             "grid": WarpedGrid(scene),
             "panels": Panels(scene),
             "onion": ArmSequence(scene, robot),
-            "compared": ComparedMotions(scene),
+            "compared": self.compared,
         }
         function = ColourSlice(scene)
         self._by_colour: dict[str, Picture] = {
@@ -196,11 +197,12 @@ class ScenePictures:
 
     @contextmanager
     def without_handles(self) -> Iterator[None]:
-        """Hide all handles for as long as a picture takes, and the table: on white it would end at the horizon."""
+        """Hide handles and names of methods while a picture is taken, and the table, which ends at the horizon."""
         table = self._by_view["table"]
         shown, table.visible = table.visible, False
         try:
             with ExitStack() as stack:
+                stack.enter_context(self.compared.without_names())
                 for markers in self.markers:
                     stack.enter_context(markers.without_handles())
                 yield
