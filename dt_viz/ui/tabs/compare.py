@@ -91,7 +91,7 @@ def hint(method: Method) -> str:
 def table_html(comparison: Sequence[Compared]) -> str:
     """Return a table of how the methods fare, each with its promise or what keeps it from moving."""
     pale = f"{_CELL};opacity:0.65"
-    heads = "".join(f"<th title='{escape(why)}' style='{pale}'>{name}</th>" for name, why in COLUMNS)
+    heads = "".join(f"<th title='{escape(why)}' style='{pale};white-space:normal'>{name}</th>" for name, why in COLUMNS)
     head = f"<tr><th style='{pale};text-align:left'>mm</th>{heads}</tr>"
     rows = "".join(_row(compared) for compared in comparison)
     table = f"<table style='border-collapse:collapse;width:100%'>{head}{rows}</table>"
