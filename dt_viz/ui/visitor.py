@@ -293,7 +293,7 @@ class Visitor(Display):
 
     def render(self, size: tuple[int, int], *, transparent: bool = False) -> bytes:
         """Render the scene as the visitor sees it, as a PNG of a width and height in pixels; see `render_png`."""
-        with self.pictures.without_handles(), self.robot.grip.hidden(), self._light():
+        with self._light(), self.pictures.without_handles(), self.robot.grip.hidden():
             return render_png(self.client, size, self._camera.shot(size), self._legends, transparent=transparent)
 
     def render_alone(self, size: tuple[int, int], timeout: float) -> bytes:
@@ -303,7 +303,7 @@ class Visitor(Display):
         shot = shot_of(view_of(self.shown.task, framing, panels=panels))
         self.robot.playback.advance(0.0)
         self.client.flush()
-        with self.pictures.without_handles(), self.robot.grip.hidden(), self._light():
+        with self._light(), self.pictures.without_handles(), self.robot.grip.hidden():
             return render_png(self.client, size, shot, self._legends, transparent=False, timeout=timeout)
 
     @property

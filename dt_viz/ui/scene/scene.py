@@ -79,14 +79,14 @@ class ScenePictures:
             Obstacles(scene, session), BiasPoints(scene, session), MovableSlice(scene, session), Starts(scene, session)
         )
         self._always: tuple[Picture, ...] = (*self.markers, LevelRollouts(scene), Goal(scene))
-        self.compared = ComparedMotions(scene)
+        self.compared, self.stage = ComparedMotions(scene), Stage(scene)
         self._by_view: dict[str, Picture] = {
             "demonstrations": demonstrations(scene),
             "rollouts": Rollouts(scene),
             "ghost": ghost(scene),
             "field": FieldArrows(scene),
             "streamlines": Streamlines(scene),
-            "table": Stage(scene),
+            "table": self.stage,
             "generator": Generator(scene),
             "grid": WarpedGrid(scene),
             "panels": Panels(scene),
@@ -197,14 +197,12 @@ class ScenePictures:
 
     @contextmanager
     def without_handles(self) -> Iterator[None]:
-        """Hide handles and names of methods while a picture is taken, and the table, which ends at the horizon."""
-        table = self._by_view["table"]
-        shown, table.visible = table.visible, False
-        try:
-            with ExitStack() as stack:
-                stack.enter_context(self.compared.without_names())
-                for markers in self.markers:
-                    stack.enter_context(markers.without_handles())
-                yield
-        finally:
-            table.visible = shown
+        """Hide handles, names of methods, table and background for as long as a picture takes."""
+        with ExitStack() as stack:
+            for around in (
+                self.stage.set_aside,
+                self.compared.without_names,
+                *(m.without_handles for m in self.markers),
+            ):
+                stack.enter_context(around())
+            yield
