@@ -11,10 +11,8 @@ from dt_viz.cli import PROG, main
 from tests.benchmarks import __main__ as benchmarks
 
 ROOT = Path(__file__).parents[1]
-DOCUMENTS = [
-    ROOT / "README.md",
-    *(path for part in ("dt_viz", "assets", "docs") for path in (ROOT / part).rglob("*.md")),
-]
+PARTS = ("dt_viz", "assets", "docs")
+DOCUMENTS = [*ROOT.glob("*.md"), *(page for part in PARTS for page in ROOT.glob(f"{part}/**/*.md"))]
 PROGRAMS = {f"{PROG} ": main, f"{benchmarks.PROG} ": benchmarks.main}
 
 
@@ -23,12 +21,12 @@ class Parsed(Exception):
 
 
 def commands(text):
-    """The commands in code blocks and in lines, without their comments and without those that stand for others."""
+    """The commands in code blocks and in lines, without comments, without those that stand for others or are a name."""
     blocks = re.findall(r"^(?: {4}|\t)(.+)$", text, re.MULTILINE)
     spans = re.findall(r"`([^`\n]+)`", text)
     for command in (part.strip() for code in (*blocks, *spans) for part in code.partition(" #")[0].split("&&")):
         for program, run in PROGRAMS.items():
-            if f"{command} ".startswith(program) and not re.search(r"[…|]|NAME", command):
+            if command.startswith(program) and not re.search(r"[…|]|NAME", command):
                 yield run, shlex.split(command[len(program) :])
 
 
