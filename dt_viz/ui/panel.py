@@ -37,7 +37,7 @@ from dt_viz.ui.tabs.picture import PictureTab, Presentation, big_type
 from dt_viz.ui.tabs.saving import Step
 from dt_viz.ui.tabs.show import ShowTab
 from dt_viz.ui.tabs.stack import StackPanel
-from dt_viz.ui.tabs.status import COLOURS, StatusLine, hint, hint_html, sentence, steps_html
+from dt_viz.ui.tabs.status import COLOURS, StatusLine, hint, hint_html, sentence
 from dt_viz.ui.tabs.teaching import TeachPanel
 from dt_viz.ui.tabs.world import add_obstacles, add_starts, add_transforms
 from dt_viz.warning import Severity
@@ -103,7 +103,6 @@ class ControlPanel:
         add_avoid_and_imitate(gui, bindings)
         self.status = StatusLine(gui, bindings)
         travels = {"Undo": Session.undo, "Redo": Session.redo, "Reset": self._reset, "Save": save}
-        self._steps = gui.add_html(steps_html((False, False)))
         buttons = gui.add_button_group("History", tuple(travels), hint=SAVE_HINT)
         bindings.on(buttons, lambda session, button: travels[button](session))
         gui.add_html(STYLE)
@@ -160,7 +159,6 @@ class ControlPanel:
     def tell(self, progress: Progress) -> None:
         """Show the verdict on what is shown, its hint, and a message, which is for a while beside the panel, too."""
         self.status.tell(progress)
-        self._steps.content = steps_html(progress.steps)
         text = "" if progress.shown is None or progress.stale else hint(progress.shown)
         self.hint.content = hint_html(text)
         self.presentation.write(caption=text)

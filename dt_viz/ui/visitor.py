@@ -40,7 +40,8 @@ from dt_viz.ui.pen import Pen
 from dt_viz.ui.playback import Playback
 from dt_viz.ui.scene.camera import CameraController, Framing, shot_of, view_of
 from dt_viz.ui.scene.export import RESOLUTIONS, render_png
-from dt_viz.ui.scene.legend import Key, Legend
+from dt_viz.ui.scene.key import Key
+from dt_viz.ui.scene.legend import Legend
 from dt_viz.ui.scene.palette import DARK, LIGHT, Colour, Theme
 from dt_viz.ui.scene.recording import record
 from dt_viz.ui.scene.robot_scene import RobotScene
@@ -309,7 +310,8 @@ class Visitor(Display):
     @property
     def _legends(self) -> list[Legend | Key]:
         """What explains the colours of a picture."""
-        return [legend for legend in (self._panel.legend, self.pictures.compared.key) if legend is not None]
+        legend = self._panel.legend
+        return [*([] if legend is None else [legend]), *self.pictures.keys]
 
     def _record(self, step: Step) -> bytes:
         """Make a page that replays what is shown; raises FormatError where that is nothing yet."""

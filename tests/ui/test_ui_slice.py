@@ -20,7 +20,8 @@ from dt_viz.session.frame import Stage
 from dt_viz.ui.scene.colour_scale import NUM_SHADES, from_oklab, oklab, ramp
 from dt_viz.ui.scene.draggables import MovableSlice, Obstacles
 from dt_viz.ui.scene.export import as_png
-from dt_viz.ui.scene.legend import OCCUPANCY, Key, drawn_onto, legend_of
+from dt_viz.ui.scene.key import Key
+from dt_viz.ui.scene.legend import OCCUPANCY, drawn_onto, legend_of
 from dt_viz.ui.scene.palette import LIGHT, css
 from dt_viz.ui.scene.picture import Look
 from dt_viz.ui.scene.rollouts import Rollouts

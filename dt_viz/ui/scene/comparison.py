@@ -16,7 +16,7 @@ from dt_viz.session.comparison import OTHERS, OURS
 from dt_viz.session.frame import Compared, Frame, Stage
 from dt_viz.ui.playback import Replay
 from dt_viz.ui.scene.arm import GhostArm
-from dt_viz.ui.scene.legend import Key
+from dt_viz.ui.scene.key import Key
 from dt_viz.ui.scene.palette import LIGHT, Colour, Theme
 from dt_viz.ui.scene.picture import Lines, Look, Picture, add_label
 from dt_viz.ui.scene.style import STYLES
@@ -71,15 +71,14 @@ class ComparedMotions(Picture):
 
     @property
     def key(self) -> Key | None:
-        """Names and colours of the motions that are shown, ours first; None while no others are."""
         shown = [method for method in OTHERS if method.name in self.motions and self.motions[method.name].node.visible]
         if not (shown and self.visible):
             return None
         return Key(((OURS.title, LIGHT.rollout), *((method.title, COLOURS[method.name]) for method in shown)))
 
     @contextmanager
-    def without_names(self) -> Iterator[None]:
-        """Hide the names beside the motions for as long as a picture takes, which has a key instead."""
+    def without_handles(self) -> Iterator[None]:
+        """Hide the names beside the motions: a picture has the key instead."""
         for motions in self.motions.values():
             motions.label.visible = False
         try:

@@ -10,7 +10,8 @@ import viser
 from PIL import Image
 
 from dt_viz.ui.scene.camera import Shot
-from dt_viz.ui.scene.legend import Key, Legend, drawn_onto
+from dt_viz.ui.scene.key import Key
+from dt_viz.ui.scene.legend import Legend, drawn_onto
 
 RESOLUTIONS = {
     "1280 × 720": (1280, 720),

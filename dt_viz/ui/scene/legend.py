@@ -1,4 +1,4 @@
-"""Legends of the colours on the slice, for the panel and for exported pictures, and of compared methods for these."""
+"""Legends of the colours on the slice, for the panel and for exported pictures."""
 
 from __future__ import annotations
 
@@ -7,16 +7,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 
 from dt_viz.pictures.slice_fields import ColourPicture
 from dt_viz.ui.scene.colour_scale import NUM_SHADES, Scale
+from dt_viz.ui.scene.key import INK, Key, plate
 from dt_viz.ui.scene.palette import LIGHT, Colour, css
 from dt_viz.ui.scene.slice_layers import DET_DECADES, OCCUPANCY_SCALE, scale_of
-
-INK: Colour = (52, 58, 68)
-"""Colour of the text in exported pictures."""
-Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
 
 
 @dataclass(frozen=True)
@@ -55,10 +52,10 @@ class Legend:
     def drawn(self, em: int) -> Image.Image:
         """Draw the legend as an RGBA image in type of a size in pixels."""
         line, left, width = round(1.45 * em), round(1.6 * em), 24 * em
-        plate, draw, font = _plate(width + 2 * left, (4 + bool(self.note)) * line, em)
+        card, draw, font = plate(width + 2 * left, (4 + bool(self.note)) * line, em)
         draw.text((left, line), self.title, INK, font, anchor="lm")
         shades = Image.fromarray(self.scale.shades[None]).resize((width, round(0.8 * em)), Image.Resampling.BILINEAR)
-        plate.paste(shades, (left, round(1.55 * line)))
+        card.paste(shades, (left, round(1.55 * line)))
         for value, text in self.ticks:
             draw.text((left + self.scale.relative(value) * width, round(2.9 * line)), text, INK, font, anchor="mm")
         if self.note:
@@ -68,24 +65,7 @@ class Legend:
                 draw.rectangle((left, low - 0.35 * em, left + 1.2 * em, low + 0.35 * em), fill=self.swatch)
                 start += round(1.7 * em)
             draw.text((start, round(3.95 * line)), self.note, INK, font, anchor="lm")
-        return plate
-
-
-@dataclass(frozen=True)
-class Key:
-    """Names of lines in a picture, each with its colour."""
-
-    lines: tuple[tuple[str, Colour], ...]
-
-    def drawn(self, em: int) -> Image.Image:
-        """Draw the key as an RGBA image in type of a size in pixels."""
-        line, left, stroke = round(1.45 * em), round(0.8 * em), round(1.6 * em)
-        widest = max(ImageFont.load_default(em).getlength(name) for name, _ in self.lines)
-        plate, draw, font = _plate(round(widest) + 3 * left + stroke, (len(self.lines) + 1) * line, em)
-        for k, (name, colour) in enumerate(self.lines, start=1):
-            draw.line((left, k * line, left + stroke, k * line), colour, max(em // 4, 2))
-            draw.text((2 * left + stroke, k * line), name, INK, font, anchor="lm")
-        return plate
+        return card
 
 
 def drawn_onto(image: Image.Image, legends: Iterable[Legend | Key]) -> Image.Image:
@@ -93,18 +73,10 @@ def drawn_onto(image: Image.Image, legends: Iterable[Legend | Key]) -> Image.Ima
     whole, em = image.copy(), round(0.022 * image.height)
     bottom = image.height - em
     for legend in legends:
-        plate = legend.drawn(em)
-        whole.alpha_composite(plate, (em, bottom - plate.height))
-        bottom -= plate.height + em // 2
+        card = legend.drawn(em)
+        whole.alpha_composite(card, (em, bottom - card.height))
+        bottom -= card.height + em // 2
     return whole
-
-
-def _plate(width: int, height: int, em: int) -> tuple[Image.Image, ImageDraw.ImageDraw, Font]:
-    """Return an almost opaque plate of a size in pixels, what draws on it, and a font."""
-    plate = Image.new("RGBA", (width, height))
-    draw = ImageDraw.Draw(plate)
-    draw.rounded_rectangle((0, 0, width - 1, height - 1), radius=em // 2, fill=(255, 255, 255, 225))
-    return plate, draw, ImageFont.load_default(em)
 
 
 OCCUPANCY = Legend(

@@ -21,6 +21,7 @@ from dt_viz.ui.scene.arm import ArmSequence
 from dt_viz.ui.scene.board import Board
 from dt_viz.ui.scene.comparison import ComparedMotions
 from dt_viz.ui.scene.draggables import BiasPoints, MovableSlice, Obstacles, Starts
+from dt_viz.ui.scene.key import Key
 from dt_viz.ui.scene.palette import LIGHT, Theme
 from dt_viz.ui.scene.panels import Panels
 from dt_viz.ui.scene.picture import Look, Picture, add_ball, add_label
@@ -79,19 +80,18 @@ class ScenePictures:
             Obstacles(scene, session), BiasPoints(scene, session), MovableSlice(scene, session), Starts(scene, session)
         )
         self._always: tuple[Picture, ...] = (*self.markers, LevelRollouts(scene), Goal(scene))
-        self.compared, self.stage = ComparedMotions(scene), Stage(scene)
         self._by_view: dict[str, Picture] = {
             "demonstrations": demonstrations(scene),
             "rollouts": Rollouts(scene),
             "ghost": ghost(scene),
             "field": FieldArrows(scene),
             "streamlines": Streamlines(scene),
-            "table": self.stage,
+            "table": Stage(scene),
             "generator": Generator(scene),
             "grid": WarpedGrid(scene),
             "panels": Panels(scene),
             "onion": ArmSequence(scene, robot),
-            "compared": self.compared,
+            "compared": ComparedMotions(scene),
         }
         function = ColourSlice(scene)
         self._by_colour: dict[str, Picture] = {
@@ -113,6 +113,11 @@ class ScenePictures:
     def layer(self, view: str) -> Picture:
         """The picture that this field of `View` shows or hides."""
         return self._by_view[view]
+
+    @property
+    def keys(self) -> list[Key]:
+        """What names lines in a saved picture."""
+        return [key for picture in self._by_view.values() if (key := picture.key) is not None]
 
     @property
     def stale(self) -> bool:
@@ -197,12 +202,8 @@ class ScenePictures:
 
     @contextmanager
     def without_handles(self) -> Iterator[None]:
-        """Hide handles, names of methods, table and background for as long as a picture takes."""
+        """Hide what is there for the page only, for as long as a picture takes."""
         with ExitStack() as stack:
-            for around in (
-                self.stage.set_aside,
-                self.compared.without_names,
-                *(m.without_handles for m in self.markers),
-            ):
-                stack.enter_context(around())
+            for picture in (*self._always, *self._by_view.values()):
+                stack.enter_context(picture.without_handles())
             yield

@@ -56,8 +56,8 @@ class Stage(Picture):
             self._paint(look.theme)
 
     @contextmanager
-    def set_aside(self) -> Iterator[None]:
-        """Hide the background, and the table, which would end at the horizon, for as long as a picture takes."""
+    def without_handles(self) -> Iterator[None]:
+        """Hide the background, and the table, which would end at the horizon of a white picture."""
         shown, self.visible = self.visible, False
         self._scene.set_background_image(None)
         try:

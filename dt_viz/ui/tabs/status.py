@@ -347,7 +347,10 @@ def sentence(text: str) -> str:
 
 
 class StatusLine:
-    """The controls of the status. They keep their height whatever comes: a button takes its room from the reason's."""
+    """The controls of the status, and the style of the buttons after them, see `steps_html`.
+
+    They keep their height whatever comes: a button takes its room from the reason's.
+    """
 
     def __init__(self, gui: viser.GuiApi, bindings: Bindings) -> None:
         """Build the controls where the panel is being built; the buttons act on the session of the bindings."""
@@ -357,6 +360,7 @@ class StatusLine:
         self.cancel = gui.add_button("Cancel", icon=viser.Icon.X, visible=False)
         with gui.add_folder("Details", expand_by_default=False):
             self.details = gui.add_html("")
+        self.steps = gui.add_html(steps_html((False, False)))
         bindings.on(self.cancel, lambda session, _pressed: session.cancel())
         bindings.on(self.mend, lambda session, _pressed: self._mend(session))
 
@@ -370,6 +374,7 @@ class StatusLine:
             (fraction, text), severity = progress.learning, Severity.NOTE
             below = progress_html(fraction)
         self._told, frame = progress, progress.shown
+        self.steps.content = steps_html(progress.steps)
         mends = None
         if frame is not None and progress.message is None and not progress.stale:
             mends = remedy(frame, progress)
