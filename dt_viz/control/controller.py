@@ -259,6 +259,11 @@ class ArmController:
         return bool(np.abs(tick.velocity).max() < self.settings.at_rest)
 
     @property
+    def is_calm(self) -> bool:
+        """Whether nothing but the robot moves, and nobody has its hand."""
+        return self._flow.is_calm and not self._activity.held
+
+    @property
     def touched(self) -> bool:
         """Whether an obstacle touches it."""
         return self._tick is not None and self._tick.clearance < -self.settings.touching

@@ -50,6 +50,11 @@ class ObstacleFlow:
         return self._duration == self._clearing.duration
 
     @property
+    def is_calm(self) -> bool:
+        """Whether obstacles rest, and the flow is settled and stays as it is."""
+        return self.is_settled and self.seen.speed == 0 and not self.changed
+
+    @property
     def transform(self) -> Diffeomorphism:
         """ψ_q, from the postures where the robot moves to those of its undisturbed motion."""
         return self._clearing.transform(self._arm, self._duration)

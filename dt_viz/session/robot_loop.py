@@ -25,6 +25,8 @@ class RoundSettings:
     """Shortest time from one tick of the controller to the next, seconds: 100 Hz."""
     most: int = 5
     """Number of ticks at once, at most: they are longer where the robot's thread is late."""
+    most_calm: int = 2
+    """The same while nothing but the robot moves, so that nothing is to be reacted to."""
     longest: float = 0.25
     """Longest time that the robot moves at once, seconds: a thread that was held up does not make it rush."""
     rest: float = 0.8
@@ -216,14 +218,15 @@ class LiveArm:
             controller.watch()
             return
         self._due = min(self._due + seconds, settings.longest)
-        num = int(self._due / settings.tick)
-        tick = max(settings.tick, self._due / settings.most)
-        passed = min(num, settings.most) * tick
+        most = settings.most_calm if controller.is_calm else settings.most
+        num = min(int(self._due / settings.tick), most)
+        tick = max(settings.tick, self._due / most)
+        passed = num * tick
         self._due -= passed
         if num:
             q = self._q
             assert q is not None
-            velocities = controller.steps(q, tick, min(num, settings.most))
+            velocities = controller.steps(q, tick, num)
             with self._changing:
                 if self._q is q:  # or it was put elsewhere meanwhile
                     self._q = q + tick * velocities.sum(axis=0)

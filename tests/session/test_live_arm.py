@@ -330,3 +330,34 @@ def test_an_arm_whose_thread_is_late_moves_as_far_in_few_ticks_and_looks_once_fo
     assert (usual["step"], late["step"]) == (pytest.approx(200, abs=1), 10 * SETTINGS.most)
     assert late["make"] <= 10 < usual["make"]
     assert 0 < left < 0.95 and abs(left - left_late) < 0.03
+
+
+def test_it_takes_few_ticks_while_nothing_else_moves_and_all_while_something_does(begin, initial, monkeypatch):
+    """The way is the same to a few millimetres; a hand and an obstacle that moves are reacted to as ever."""
+    scenario = changed(initial("push_box"), space="cspace")
+    steps, nums = ArmController.steps, []
+
+    def counted(controller, q, dt, num):
+        nums.append(num)
+        return steps(controller, q, dt, num)
+
+    monkeypatch.setattr(ArmController, "steps", counted)
+    loop = begin(scenario).run(1)
+    assert set(nums[5:]) == {SETTINGS.most_calm}
+    loop.run(5)
+    fine = begin(scenario)
+    fine.arm = LiveArm(fine.engine.follower, replace(SETTINGS, most_calm=SETTINGS.most))
+    fine.arm.follow(fine.frame.motion, fine.frame.chosen)
+    fine.run(6)
+    hands, others = (each.robot.end_effector(np.array(each.passed)) for each in (loop, fine))
+    assert distance_from_path(hands, others).max() < 3e-3
+
+    nums.clear()
+    fine.arm = loop.arm
+    loop.arm.hold(loop.hand)
+    loop.run(0.2)
+    loop.arm.release()
+    for k in range(5):
+        loop.arm.see(replace(scenario.arm_avoidance, obstacles=(sphere_at((0.4, -0.3, 0.5 + 0.01 * k)),)))
+        loop.run(PICTURE)
+    assert min(nums) >= round(PICTURE / SETTINGS.tick)
