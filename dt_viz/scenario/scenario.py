@@ -103,6 +103,7 @@ class View:
         "Lyapunov value, distance to the demonstration and clearance along the arm's rollout",
         needs=(),
     )
+    large_plots: bool = _offered(False, "Large plots", "in windows over the scene, which can be moved and docked")
     compared: tuple[str, ...] = _offered((), needs=("their_arm",))
     """Names of methods whose motions are shown beside ours."""
     their_arm: str = ""
@@ -143,7 +144,7 @@ class View:
     """Label that new starts get; see `Start`."""
     playing: bool = True
     """Whether the arm moves."""
-    replay: bool = _offered(False, "Replay", "its motion again and again, finished, instead of an arm that reacts")
+    replay: bool = _offered(False, "Replay", "its motion, finished, instead of an arm that reacts, with a timeline")
     speed: float = _offered(1.0, "Speed", "of the arm: 1 is real time", limits=(0.25, 3.0, 0.25))
     bias: str = ""
     """Name of the bias point that the panel changes; the newest if empty."""

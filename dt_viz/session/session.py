@@ -31,7 +31,7 @@ from dt_viz.warning import Severity
 
 logger = logging.getLogger(__name__)
 
-HABITS = ("playing", "replay", "speed", "joint_plots", "health_plots")
+HABITS = ("playing", "replay", "speed", "joint_plots", "health_plots", "large_plots")
 """Fields of the view that are a visitor's way of working, and stay when a scene of the paper comes or goes."""
 REST = 0.1
 """Time that a scenario must rest before it is refined, seconds: while a hand moves, edits come faster."""

@@ -24,13 +24,14 @@ from dt_viz.session.session import CHOICES, Session
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.controls import Control
 from dt_viz.ui.pen import Pen
+from dt_viz.ui.playback import Playback
 from dt_viz.ui.scene.camera import CameraController
 from dt_viz.ui.scene.figure import render_figure
 from dt_viz.ui.scene.legend import Legend
 from dt_viz.ui.scene.palette import Colour
 from dt_viz.ui.scripts import Link
 from dt_viz.ui.tabs.about import Command, add_about, add_commands, numbered
-from dt_viz.ui.tabs.arm import add_arm, add_joints, play_or_pause
+from dt_viz.ui.tabs.arm import add_arm, add_joints
 from dt_viz.ui.tabs.compare import ComparePanel
 from dt_viz.ui.tabs.opening import OpenPanel, Show
 from dt_viz.ui.tabs.picture import PictureTab, Presentation, big_type
@@ -39,6 +40,7 @@ from dt_viz.ui.tabs.show import ShowTab
 from dt_viz.ui.tabs.stack import StackPanel
 from dt_viz.ui.tabs.status import COLOURS, StatusLine, hint, hint_html, sentence
 from dt_viz.ui.tabs.teaching import TeachPanel
+from dt_viz.ui.tabs.timeline import PAST
 from dt_viz.ui.tabs.world import add_obstacles, add_starts, add_transforms
 from dt_viz.warning import Severity
 
@@ -116,7 +118,7 @@ class ControlPanel:
         with tabs.add_tab("Show"):
             self.show = ShowTab(gui, bindings)
         with tabs.add_tab("Arm"):
-            add_arm(gui, bindings, arms, self.begin)
+            add_arm(gui, bindings, arms, self.begin, lambda session: self.show.timeline.show(session, PAST))
             add_joints(gui, bindings, send)
         with tabs.add_tab("Compare"):
             self._compare = ComparePanel(gui, bindings)
@@ -130,7 +132,7 @@ class ControlPanel:
 
     def take(self, robot: Robot) -> None:
         """Plot the joints of another arm, and offer the scenes that it has."""
-        self.show.joints.take(robot)
+        self.show.plots.take(robot)
         offers = {scene.title: scene for scene in offered(self._titles, jaco=is_jaco(robot))}
         if offers != self._scenes:
             self._scenes, self._scene.handle.options = offers, (NO_SCENE, *offers)
@@ -143,6 +145,10 @@ class ControlPanel:
     def legend(self) -> Legend | None:
         """Legend of the colours on the slice."""
         return self.show.legend
+
+    def pose(self, playback: Playback) -> None:
+        """Show what a playback shows now on the timeline; called by its thread."""
+        self.show.timeline.follow(playback)
 
     def adopt(self, scenario: Scenario) -> None:
         """Show the scenario's choices."""
@@ -289,7 +295,7 @@ class ControlPanel:
             opening.later(opening.close)
 
         return [
-            Command("Pause, or play", play_or_pause, "space"),
+            *self.show.timeline.commands,
             Command("Reset the scene and the camera", self._reset, "R"),
             Command("Undo", Session.undo, "Z"),
             Command("Redo", Session.redo, "Z", shifted=True),

@@ -52,6 +52,7 @@ class Pen:
         self._area = board_of(session.robot) if kind == "draw" else None
         if session.scenario.view.replay:  # its arm cannot be held
             session.step("replay", view=replace(session.scenario.view, replay=False))
+        robot.playback.resume()
         robot.playback.live.see(None)
         robot.grip.guide(None if kind == "draw" else self._moved)
         robot.set_aside(True)

@@ -1,8 +1,9 @@
-"""Poses the arm: the one in the loop, or, in replay, along its newest motion again and again."""
+"""Poses the arm: the one in the loop, or, in its place, its finished motion, or what it did before."""
 
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,14 +13,17 @@ import numpy as np
 
 from dt_viz.flows.fields import Array
 from dt_viz.metrics import interpolate
-from dt_viz.session.engine import ArmMotion
+from dt_viz.motion.following import ArmMotion
 from dt_viz.session.jobs import Jobs
+from dt_viz.session.recording import Past, Recording
 from dt_viz.session.robot_loop import LiveArm, RoundSettings
 
 logger = logging.getLogger(__name__)
 
 LANE = "arm"
 """Lane of the jobs on which the arm moves."""
+ALIKE = 1e-6
+"""Distance of two moments that are one, seconds."""
 
 
 @dataclass(frozen=True)
@@ -37,25 +41,83 @@ class PlaybackSettings:
 
 
 class Replay:
-    """A motion that is shown in a loop, like the arm in the loop; a new one takes over at the same moment of it."""
+    """A motion that is played, like the arm in the loop; a new one takes over at the same moment of it."""
 
     def __init__(self) -> None:
         self.motion: ArmMotion | None = None
         """The motion; None before there is one."""
+        self.playing, self.loops, self.speed = True, True, 1.0
+        """Whether its time passes, whether it begins anew after its end, and its speed relative to real time."""
+        self.jumps = 0
+        """Number of times that it was taken to another moment."""
         self._clock = 0.0
+        self._changing = threading.Lock()  # the page takes it to a moment while its time passes
 
-    def advance(self, seconds: float, *, moves: bool = True) -> None:
-        """Let some time pass."""
-        self._clock += seconds if moves else 0.0
+    def advance(self, seconds: float) -> None:
+        """Let some real time pass."""
+        with self._changing:
+            if not self.playing:
+                return
+            before = self.clock
+            self._clock += self.speed * seconds
+            if not self.loops and self.motion is not None and before + self.speed * seconds >= self.duration:
+                self._clock, self.playing = self.duration, False
 
     def restart(self) -> None:
         """Begin the loop anew."""
-        self._clock = 0.0
+        with self._changing:
+            self._clock = 0.0
+
+    def play(self) -> None:
+        """Play it from where it is, or, where that is its end, from its beginning."""
+        with self._changing:
+            if self.clock >= self.duration:
+                self._clock = 0.0
+                self.jumps += 1
+            self.playing = True
+
+    def seek(self, moment: float) -> None:
+        """Hold it at a moment of it, seconds."""
+        with self._changing:
+            self._clock, self.playing = min(max(moment, 0.0), self.duration), False
+            self.jumps += 1
+
+    def step(self, num: int) -> None:
+        """Hold it so many samples of it later, or earlier if negative."""
+        motion, moment = self.motion, self.moment
+        if motion is not None:
+            earlier, later = np.searchsorted(motion.times, (moment - ALIKE, moment + ALIKE))
+            place = int(later + num - 1 if num > 0 else earlier + num)
+            self.seek(float(motion.times[min(max(place, 0), len(motion.times) - 1)]))
+
+    @property
+    def duration(self) -> float:
+        """Time from its beginning to its end, seconds; 0 before there is a motion."""
+        return 0.0 if self.motion is None else float(self.motion.times[-1])
+
+    @property
+    def clock(self) -> float:
+        """Time in the loop, seconds: that in the motion, and then that of a rest at its end."""
+        return self._clock % (self.duration + RoundSettings().rest)
+
+    @property
+    def moment(self) -> float:
+        """Time in the motion, seconds."""
+        return min(self.clock, self.duration)
 
     @property
     def arrived(self) -> float:
         """Time since the goal was reached, seconds; 0 before."""
-        return 0.0 if self.motion is None else max(0.0, self._moment(self.motion) - self.motion.times[-1])
+        motion = self.motion
+        if isinstance(motion, Past):
+            return float(motion.arrived[_newest(motion.times, self.moment)])
+        return 0.0 if motion is None else max(0.0, self.clock - self.duration)
+
+    @property
+    def seeks(self) -> bool:
+        """Whether the arm is on its way to the goal."""
+        motion = self.motion
+        return not isinstance(motion, Past) or bool(motion.seeks[_newest(motion.times, self.moment)])
 
     @property
     def q(self) -> Array | None:
@@ -69,12 +131,28 @@ class Replay:
         motion = self.motion
         return None if motion is None else self._now(motion, motion.without)
 
-    def _now(self, motion: ArmMotion, path: Array) -> Array:
-        return interpolate(np.array([self._moment(motion)]), motion.times, path)[0]
+    @property
+    def trace(self) -> tuple[Array, Array]:
+        """Joint angles (K, n), rad, since the arm set out from a start last, and the times since it arrived (K,)."""
+        motion = self.motion
+        return (np.empty((0, 0)), np.empty(0)) if motion is None else trace(motion, self.moment)
 
-    def _moment(self, motion: ArmMotion) -> float:
-        """Time in the loop, seconds."""
-        return self._clock % (motion.times[-1] + RoundSettings().rest)
+    def _now(self, motion: ArmMotion, path: Array) -> Array:
+        return interpolate(np.array([self.moment]), motion.times, path)[0]
+
+
+def trace(motion: ArmMotion, moment: float) -> tuple[Array, Array]:
+    """Return what a motion does until a moment, seconds, since it set out from a start last; see `Replay.trace`."""
+    end = _newest(motion.times, moment) + 1
+    arrived = motion.arrived[:end] if isinstance(motion, Past) else np.zeros(end)
+    sets_out = np.flatnonzero((arrived[1:] == 0) & (arrived[:-1] > 0)) + 1
+    begin = sets_out[-1] if len(sets_out) else 0
+    return motion.q[begin:end], arrived[begin:]
+
+
+def _newest(times: Array, moment: float) -> int:
+    """Place of the last of the times (T,) that is no later than a moment; of the first if none is."""
+    return max(0, int(np.searchsorted(times, moment, side="right")) - 1)
 
 
 class Playback:
@@ -84,13 +162,17 @@ class Playback:
         self, live: LiveArm, draw: Callable[[], None], settings: PlaybackSettings = PlaybackSettings()
     ) -> None:
         """Take the arm in the loop, and what draws it; it moves from `begin` on."""
-        self.live, self.replay = live, Replay()
+        self.live, self.replay, self.past = live, Replay(), Replay()
+        """The arm in the loop, its finished motion, and what it did before `rewind`."""
         self.arm: LiveArm | Replay = live
-        """What moves now, with its joint angles `q` and `undisturbed`, (n,), rad, and the time since it `arrived`."""
+        """What is shown, with its joint angles `q` and `undisturbed`, (n,), rad, and the time since it `arrived`."""
+        self.recording = Recording()
         self.neglected = False
         """Whether nobody has touched the page for a while, and others need the processor: the goal is not left then."""
         self._draw, self._settings = draw, settings
         self._playing, self._speed = True, 1.0
+        self._returns = 0
+        """Number of times that the robot was shown again after its past."""
 
     @property
     def note(self) -> str:
@@ -101,21 +183,86 @@ class Playback:
     def _waits(self) -> bool:
         return self.neglected and 0 < self.arm.arrived < RoundSettings().rest
 
+    @property
+    def player(self) -> Replay | None:
+        """What is played in place of the arm in the loop; None while that is shown."""
+        return None if self.arm is self.live else self.past if self.arm is self.past else self.replay
+
+    @property
+    def jumps(self) -> int:
+        """Number of times that what is shown has not gone on from where it was."""
+        return self.replay.jumps + self.past.jumps + self._returns
+
+    @property
+    def trace(self) -> tuple[Array, Array]:
+        """What is shown since it set out from a start; see `Replay.trace`."""
+        if (player := self.player) is not None:
+            return player.trace
+        past = self.recording.past
+        return (np.empty((0, 0)), np.empty(0)) if past is None else trace(past, past.times[-1])
+
+    @property
+    def pace(self) -> float:
+        """Speed at which the time of what is shown passes, relative to real time."""
+        player = self.player
+        playing, speed = (self._playing, self._speed) if player is None else (player.playing, player.speed)
+        return speed if playing else 0.0
+
     def begin(self, jobs: Jobs, fail: Callable[[Exception], None]) -> None:
         """Move the arm until the jobs are closed; `fail` is told what stops it until its next motion."""
         jobs.submit(LANE, partial(self._loop, jobs, fail))
 
     def play(self, playing: bool, speed: float, *, replays: bool) -> None:
-        """Choose whether and how fast the arm moves, and whether it repeats its motion; later it goes on from there."""
+        """Choose whether and how fast the robot moves, and whether its motion is shown in its place.
+
+        Later the robot goes on from where the motion was; what it did before stays shown unless the motion is.
+        """
         left = self.arm.q
-        if self.arm is self.replay and not replays and left is not None:
-            self.live.put(left)
-        self._playing, self._speed, self.arm = playing, speed, self.replay if replays else self.live
+        self._playing, self._speed = playing, speed
+        if replays:
+            self.arm = self.replay
+        elif self.arm is self.replay:
+            if left is not None:
+                self.live.put(left)
+            self.arm = self.live
+
+    def rewind(self) -> bool:
+        """Show what the robot has done until now, held at its end; return whether there is something.
+
+        The robot goes on meanwhile, until `resume`.
+        """
+        past = self.recording.past
+        if past is None:
+            return False
+        self.live.release()  # a drag of the ball, which is hidden, ends without an event
+        self.past.motion = past
+        self.past.seek(self.past.duration)
+        self.arm = self.past
+        return True
+
+    def resume(self) -> None:
+        """Show the robot again in place of what it did."""
+        if self.arm is self.past:
+            self.arm = self.live
+            self._returns += 1
 
     def advance(self, seconds: float) -> None:
         """Let some real time pass, in seconds, and have the arm drawn; called by one thread only."""
-        self.arm.advance(self._speed * seconds, moves=self._playing)
+        player = self.player
+        if player is not self.replay:
+            self._go_on(seconds)
+        if player is not None:
+            player.advance(seconds)
         self._draw()
+
+    def _go_on(self, seconds: float) -> None:
+        """Move the robot, and remember where it is; a pause, unless the hand is held in it, is not remembered."""
+        live = self.live
+        before = live.q
+        live.advance(self._speed * seconds, moves=self._playing)
+        q, without = live.q, live.undisturbed
+        if q is not None and (self._playing or q is not before):
+            self.recording.add(seconds, q, q if without is None else without, live.arrived, seeks=live.left < 1)
 
     def _loop(self, jobs: Jobs, fail: Callable[[Exception], None]) -> None:
         period = self._settings.shortest

@@ -155,6 +155,8 @@ class Visitor(Display):
             self._exchange(frame.scenario.arm)
         settled = frame.stage is not Stage.ROLLOUTS and self._previews is False
         others = settled and len(beside) != len(self._camera.panels)
+        if self.shown is not None and frame.task is not self.shown.task:
+            self.robot.playback.resume()
         if self.shown is None or frame.task is not self.shown.task or others:
             self._camera.look(frame.task, beside)
         if (sight := self._keeper.sight(frame)) is not None:
@@ -251,6 +253,7 @@ class Visitor(Display):
         self._camera.turn(now)
         with self._exchanging:
             self.robot.pose(now, self.pictures.look.tubes)
+            self._panel.pose(self.robot.playback)
 
     def _exchange(self, name: str) -> None:
         """Draw the arm of a name in place of the one that is drawn."""

@@ -300,7 +300,7 @@ def test_commands_do_what_the_controls_do_each_on_a_key_of_its_own(page):
     commands = page.commands
     keys = [(command.hotkey, command.modifier) for command in commands.values() if command.hotkey is not None]
     assert len(set(keys)) == len(keys)
-    named = *"RZFHOLPTB123456789", "space", "escape", "pagedown", "pageup"
+    named = *"RZFHOLPTBJK123456789", "space", "escape", "pagedown", "pageup"
     assert set(keys) == {(key, None) for key in named} | {("Z", "shift")}
     by_key = {(command.hotkey, command.modifier): command for command in commands.values()}
     before = page.session.scenario

@@ -56,7 +56,7 @@ def test_the_slice_moves_along_the_arrow_that_is_dragged(drawn):
 def test_each_layer_is_shown_while_its_checkbox_is_on(drawn, name):
     arms, show = drawn.visitor.robot.arms, drawn.visitor._panel.show
     beside_layers = {"arm": arms.arm, "ghost_arm": arms.ghost, "body_points": arms.body}
-    beside_layers |= {"joint_plots": show.joints, "health_plots": show.health}
+    beside_layers |= {"joint_plots": show.plots.joints[0], "health_plots": show.plots.health[0]}
     picture = beside_layers[name] if name in beside_layers else drawn.visitor.pictures.layer(name)
     assert not picture.visible
     drawn.claim(drawn[OFFERS[name].label], True)
@@ -67,6 +67,18 @@ def test_each_layer_is_shown_while_its_checkbox_is_on(drawn, name):
         assert name in {"ghost_arm", "table"} or max(np.ptp(array, axis=0).max() for array in arrays) > 0.05
     drawn.claim(drawn[OFFERS[name].label], False)
     assert not picture.visible
+
+
+def test_the_past_stays_shown_while_its_task_is_edited_and_no_longer(drawn, at_rest):
+    playback, home = drawn.visitor.robot.playback, drawn.session.robot.home
+    for k in range(10):
+        playback.recording.add(0.1, home + 0.1 * k, home, 0.0, seeks=True)
+    assert playback.rewind()
+    drawn.visitor.draw(at_rest(avoiding("draw_s", Sphere(MIDDLE)), Stage.LIVE), PACE)
+    drawn.session.edit("test", warp=0.5)
+    assert playback.player is playback.past
+    drawn.visitor.draw(at_rest(avoiding("draw_j", ()), Stage.LIVE), PACE)
+    assert playback.player is None
 
 
 def shown_in(page, folder):

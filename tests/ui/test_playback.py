@@ -1,4 +1,4 @@
-"""Playback: the arm in the loop, or its finished motion again and again, on a thread of its own."""
+"""Playback: the arm in the loop, its finished motion, or what it did before, on a thread of its own."""
 
 import threading
 import time
@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from pages import PATIENCE
 
-from dt_viz.session.engine import ArmMotion
+from dt_viz.motion.following import ArmMotion
 from dt_viz.session.jobs import Jobs
+from dt_viz.session.recording import LEAST, Past
 from dt_viz.session.robot_loop import RoundSettings
 from dt_viz.ui.playback import Playback, PlaybackSettings, Replay
 
@@ -21,15 +22,19 @@ class Arm:
     """An arm in the loop whose first joint turns by a radian in a second."""
 
     def __init__(self):
-        self.q, self.undisturbed, self.arrived = np.zeros(6), np.ones(6), 0.0
+        self.q, self.undisturbed, self.arrived, self.left = np.zeros(6), np.ones(6), 0.0, 1.0
         self.asked = []
 
     def advance(self, seconds, *, moves):
         self.asked.append((seconds, moves))
-        self.q = self.q + seconds * moves * np.eye(6)[0]
+        if moves:
+            self.q = self.q + seconds * np.eye(6)[0]
 
     def put(self, q):
         self.q = q
+
+    def release(self):
+        pass
 
 
 def unexpected(error):
@@ -218,3 +223,175 @@ class TestReplay:
             and player.playback.arm.undisturbed is None
             and player.playback.arm.arrived == 0
         )
+
+
+@pytest.fixture
+def replay():
+    """A motion of unevenly sampled 2 seconds, whose first joint is at the time squared."""
+    replay, times = Replay(), 2 * np.linspace(0, 1, 30) ** 1.5
+    replay.motion = ArmMotion(times, times[:, None] ** 2 * np.eye(6)[:1], np.zeros((30, 6)))
+    return replay
+
+
+class TestPlayer:
+    @pytest.mark.parametrize("moment", [0.0, 0.01, 0.7, 1.2345, 2.0])
+    def test_what_is_shown_is_between_the_samples_beside_the_moment(self, replay, moment):
+        replay.seek(moment)
+        assert replay.moment == moment and not replay.playing
+        assert replay.q[0] == pytest.approx(np.interp(moment, replay.motion.times, replay.motion.q[:, 0]), abs=1e-12)
+        assert (replay.q[1:] == 0).all()
+
+    def test_it_is_held_where_it_is_taken_to_and_plays_on_from_there(self, replay):
+        replay.seek(0.5)
+        replay.advance(0.3)
+        assert replay.moment == 0.5
+        replay.play()
+        replay.advance(0.3)
+        assert replay.moment == pytest.approx(0.8)
+
+    @pytest.mark.parametrize("moment", [-1.0, 1e9])
+    def test_it_is_taken_no_farther_than_its_ends(self, replay, moment):
+        replay.seek(moment)
+        assert replay.moment == np.clip(moment, 0.0, 2.0)
+
+    def test_a_step_is_one_sample(self, replay):
+        times = replay.motion.times
+        replay.seek(0.0)
+        seen = [replay.moment]
+        for _ in times[1:]:
+            replay.step(1)
+            seen.append(replay.moment)
+        np.testing.assert_array_equal(seen, times)
+        for _ in times[1:]:
+            replay.step(-1)
+            seen.append(replay.moment)
+        np.testing.assert_array_equal(seen[len(times) :], times[-2::-1])
+        replay.step(-1)
+        assert replay.moment == 0.0
+
+    def test_a_step_from_between_two_samples_goes_to_the_one_beside(self, replay):
+        times = replay.motion.times
+        for num, expected in ((1, times[11]), (-1, times[10])):
+            replay.play()
+            replay.seek((times[10] + times[11]) / 2)
+            replay.step(num)
+            assert replay.moment == expected and not replay.playing
+
+    @pytest.mark.parametrize("speed", [0.25, 1.0, 3.0])
+    def test_its_time_passes_at_its_speed(self, replay, speed):
+        replay.speed = speed
+        for _ in range(10):
+            replay.advance(0.05)
+        assert replay.moment == pytest.approx(0.5 * speed)
+
+    def test_in_a_loop_it_begins_anew_after_a_rest(self, replay):
+        replay.seek(1.9)
+        replay.play()
+        replay.advance(0.1 + REST / 2)
+        assert replay.moment == 2.0 and replay.playing and replay.arrived == pytest.approx(REST / 2)
+        replay.advance(REST / 2 + 0.3)
+        assert replay.moment == pytest.approx(0.3) and replay.playing and replay.arrived == 0
+
+    @pytest.mark.parametrize("begin", [1.9, 2.0 + REST / 2])
+    def test_without_a_loop_it_ends_and_is_played_from_its_beginning(self, replay, begin):
+        replay.advance(begin)
+        replay.loops = False
+        replay.advance(0.3)
+        assert replay.moment == 2.0 and not replay.playing
+        replay.play()
+        replay.advance(0.3)
+        assert replay.moment == pytest.approx(0.3) and replay.playing
+
+    def test_without_a_motion_nothing_is_done(self):
+        replay = Replay()
+        replay.step(1)
+        replay.seek(1.0)
+        replay.play()
+        replay.loops = False
+        replay.advance(0.3)
+        assert replay.moment == replay.duration == 0.0 and replay.q is None and len(replay.trace[0]) == 0
+
+
+class TestPast:
+    @pytest.fixture(autouse=True)
+    def _did_something(self, player):
+        player.play(1.0)
+
+    def test_it_is_what_was_drawn_and_is_held_at_its_end(self, player):
+        places, now = player.places[:], player.arm.q[0]
+        assert player.playback.rewind() and player.playback.arm is player.playback.past
+        past = player.playback.past
+        assert past.moment == past.duration and not past.playing
+        assert past.q[0] == pytest.approx(now, abs=LEAST)
+        assert set(past.motion.q[:, 0]) <= set(places) and len(past.motion.q) > 0.8 * 1.0 / (LEAST + PICTURE)
+        assert (past.undisturbed == 1).all()
+
+    def test_the_robot_goes_on_meanwhile_and_is_shown_again(self, player):
+        player.playback.rewind()
+        left = player.arm.q[0]
+        held = player.play(0.5)
+        assert len(set(held)) == 1 and player.arm.q[0] == pytest.approx(left + 0.5)
+        player.playback.resume()
+        assert player.play(PICTURE)[-1] == pytest.approx(left + 0.5 + PICTURE)
+
+    def test_what_it_does_meanwhile_is_remembered_too(self, player):
+        player.playback.rewind()
+        before = player.playback.past.duration
+        player.play(0.5)
+        assert player.playback.past.duration == before
+        player.playback.rewind()
+        assert player.playback.past.duration == pytest.approx(before + 0.5, abs=LEAST)
+
+    def test_another_choice_leaves_it_shown_until_the_motion_is_chosen(self, player):
+        player.playback.rewind()
+        player.playback.play(False, 2.0, replays=False)
+        assert player.playback.player is player.playback.past
+        player.playback.play(True, 1.0, replays=True)
+        assert player.playback.player is player.playback.replay
+
+    def test_from_the_motion_to_the_past_and_back_the_robot_is_where_it_was(self, player):
+        player.playback.replay.motion = ramp(3.0, 4.0, 0.5)
+        player.playback.play(True, 1.0, replays=True)
+        player.play(0.1)
+        left = player.arm.q[0]
+        player.playback.rewind()
+        player.playback.play(True, 1.0, replays=False)
+        player.playback.resume()
+        assert player.arm.q[0] == left
+
+    def test_a_pause_is_not_remembered_but_a_held_hand_is(self, player):
+        player.playback.play(False, 1.0, replays=False)
+        player.play(5.0)
+        player.playback.rewind()
+        assert player.playback.past.duration < 1.0
+        player.playback.resume()
+        player.arm.advance = lambda seconds, *, moves: player.arm.put(player.arm.q + 0.1)
+        player.play(0.5)
+        player.playback.rewind()
+        assert player.playback.past.duration == pytest.approx(1.5, abs=2 * LEAST)
+
+    def test_each_jump_is_counted(self, player):
+        playback, counted = player.playback, []
+        for jump in (playback.rewind, lambda: playback.past.step(-1), lambda: playback.past.seek(0.2), playback.resume):
+            before = playback.jumps
+            jump()
+            counted.append(playback.jumps - before)
+        assert counted == [1, 1, 1, 1]
+        player.play(0.3)
+        assert playback.jumps == before + 1
+
+
+def test_nothing_is_shown_of_a_robot_that_has_done_nothing(player):
+    assert not player.playback.rewind() and player.playback.player is None
+
+
+def test_what_it_did_since_it_set_out_is_traced():
+    replay, arrived = Replay(), np.array([0, 0, 0.1, 0.2, 0, 0, 0, 0.1])
+    times = np.arange(8.0)
+    q = times[:, None] * np.ones(6)
+    replay.motion = Past(times, q, q, arrived=arrived, seeks=(arrived == 0).astype(float))
+    for moment, begin, end in ((1.5, 0, 2), (3.0, 0, 4), (4.0, 4, 5), (7.0, 4, 8)):
+        replay.seek(moment)
+        np.testing.assert_array_equal(replay.trace[0], q[begin:end])
+        np.testing.assert_array_equal(replay.trace[1], arrived[begin:end])
+        assert replay.arrived == arrived[end - 1] and replay.seeks == (arrived[end - 1] == 0)

@@ -384,7 +384,7 @@ def test_plots_are_drawn_only_while_shown_with_the_limits_of_limited_joints(serv
 
 def test_every_layer_has_a_checkbox():
     switches = {f.name for f in fields(View) if f.type == "bool"}
-    switches -= {"playing", "replay", "move_slice", "click_to_start", "handles", "bias_handles"}
+    switches -= {"playing", "replay", "move_slice", "click_to_start", "handles", "bias_handles", "large_plots"}
     assert {*IN_SCENE, "joint_plots", "health_plots"} == switches | {"panels"}
 
 

@@ -71,7 +71,7 @@ def test_joints_scenes_plots_and_the_loop_are_those_of_the_arm(page):
     assert num_joints(page) == 7 and visitor.robot.playback.live is page.session.engine.arm is not live
     assert visitor.pictures.layer("onion") is not onion
     assert not OF_JACO & set(page["Scene"].options) and set(page["Scene"].options) < set(scenes)
-    plots = visitor._panel.show.joints
+    plots = visitor._panel.show.plots.joints[0]
     assert len(plots.speeds.series) == len(plots.speeds.data) == 1 + 7 + 1
     assert visitor._camera.framing.arm_size == robot.size
     visitor.robot.arms.pose(robot.home, robot.home)

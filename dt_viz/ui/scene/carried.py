@@ -89,7 +89,11 @@ class Drawing:
         self._touched = touches
         if moment - self._drawn > INK_PERIOD and touches:
             self._drawn = moment
-            self.ink.show([np.array(stroke) for stroke in strokes if len(stroke) > 1], theme)
+            self.draw(theme)
+
+    def draw(self, theme: Theme) -> None:
+        """Show all that the pen has drawn."""
+        self.ink.show([np.array(stroke) for stroke in self._strokes if len(stroke) > 1], theme)
 
     def _wipe(self) -> None:
         self._strokes, self._touched = [], False
@@ -148,6 +152,13 @@ class Carried:
         for each, handle in self.items:
             handle.visible = arm and (self._hand is not None or each.start is not None)
         self.drawing.show(arm=arm)
+
+    def retrace(self, places: Array, arrived: Array, theme: Theme) -> None:
+        """Begin anew, and let the hand go along places (K, 3), metres, with the times since it arrived (K,), s."""
+        self._hand = None
+        for place, rested in zip(places, arrived, strict=True):
+            self.pose(-np.inf, place, rested, theme)
+        self.drawing.draw(theme)
 
     def pose(self, now: float, place: Array, arrived: float, theme: Theme) -> bool:
         """Let the hand go on; return whether it sets out from a start.

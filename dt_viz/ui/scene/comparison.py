@@ -122,14 +122,17 @@ class TheirArm:
         """Show or hide it; it is hidden until it has a motion."""
         self._ghost.visible = shown and self._replay.motion is not None
 
-    def pose(self, now: float, q: Array, speed: float, *, sets_out: bool) -> None:
-        """Go on to a moment, seconds, at a speed relative to real time, beside our arm at `q` (n,), rad."""
+    def pose(self, now: float, q: Array, pace: float, *, sets_out: bool, clock: float | None = None) -> None:
+        """Go on to a moment, seconds, at a pace relative to real time, beside our arm at `q` (n,), rad.
+
+        Where our motion is played, its `clock` is theirs, too; see `Replay.clock`.
+        """
         before, self._seen = self._seen, now
         if not self._ghost.visible:
             return
-        if sets_out:
+        if sets_out or clock is not None:
             self._replay.restart()
-        self._replay.advance(speed * (now - before))
+        self._replay.advance(pace * (now - before) if clock is None else clock)
         theirs = self._replay.q
         if theirs is not None:
             self._ghost.pose(q, theirs)

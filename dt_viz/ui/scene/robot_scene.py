@@ -36,8 +36,8 @@ class RobotScene:
         self._view, self._theme = View(), LIGHT
         self._aside = False
         """Whether what the arm is about to do is not shown."""
-        self._posed: tuple[bytes, bool] | None = None
-        """The posture that was drawn last, and whether with that without avoidance."""
+        self._posed: tuple[bytes, bool, int] | None = None
+        """The posture that was drawn last, whether with that without avoidance, and after how many jumps."""
 
     def remove(self) -> None:
         """Take it from the scene."""
@@ -76,10 +76,10 @@ class RobotScene:
         self._show_way()
 
     def _show_way(self) -> None:
-        view = self._view
+        view, live = self._view, self.playback.player is None
         self.carried.show(arm=view.arm and not self._aside)
-        self.path.visible = view.arm and not view.replay and not self._aside
-        self.grip.visible = not view.replay and (not self._aside or self.grip.guides)
+        self.path.visible = view.arm and live and not self._aside
+        self.grip.visible = live and (not self._aside or self.grip.guides)
 
     def adopt(self, view: View, look: Look) -> None:
         """Show and hide what a view says, beside a frame that was drawn with a look."""
@@ -87,11 +87,10 @@ class RobotScene:
         arm.stale = view.replay and (arm.stale or look.blocked)
         self.arms.show(view)
         self.their_arm.show(bool(view.their_arm))
-        self._show_way()
         if view.replay:  # a drag of the ball ends without an event
             self.playback.live.release()
-            self.path.forget()
         self.playback.play(view.playing, view.speed, replays=view.replay)
+        self._show_way()
 
     def pose(self, now: float, tubes: RolloutTubes) -> None:
         """Draw all where it is at a moment, seconds; called by the playback's thread.
@@ -104,8 +103,8 @@ class RobotScene:
         q = arm.q
         if q is None:
             return
-        posed = q.tobytes(), view.ghost_arm or view.body_points
-        moves = posed != self._posed
+        before, posed = self._posed, (q.tobytes(), view.ghost_arm or view.body_points, playback.jumps)
+        moves, jumped = posed != before, before is not None and posed[2] != before[2]
         # a block wakes the connection, also if nothing is sent
         drawn = moves or bool(view.their_arm) or self.path.is_due(now)
         with self._client.atomic() if drawn else nullcontext():
@@ -113,12 +112,19 @@ class RobotScene:
                 self._posed = posed
                 without = arm.undisturbed if posed[1] else None
                 self.arms.pose(q, q if without is None else without)
-            hand, speed = self._robot.end_effector(q), view.speed if view.playing else 0.0
+            if jumped:
+                self._show_way()
+                joints, arrived = playback.trace
+                self.carried.retrace(self._robot.end_effector(joints) if len(joints) else joints, arrived, self._theme)
+            hand = self._robot.end_effector(q)
             sets_out = self.carried.pose(now, hand, arm.arrived, self._theme)
-            self.their_arm.pose(now, q, speed, sets_out=sets_out)
-            if not view.replay:
+            clock = playback.replay.clock if arm is playback.replay else None
+            self.their_arm.pose(now, q, playback.pace, sets_out=sets_out, clock=clock)
+            if arm is playback.live:
                 self.path.show(now, hand, lambda: playback.live.ahead, tubes, self._theme)
                 self.grip.say(playback.note)
+            else:
+                self.path.forget()
 
     def _hold(self, place: Array, phase: str) -> None:
         self.playback.live.hold(place)

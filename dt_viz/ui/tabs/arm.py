@@ -17,6 +17,7 @@ from dt_viz.scenario.roaming import Chase, MovingGoal
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.session.frame import Stage
 from dt_viz.session.player import Play
+from dt_viz.session.recording import SPAN
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import KEEP, Bindings
 from dt_viz.ui.controls import Control
@@ -30,8 +31,17 @@ JOINT_FORMATS: Mapping[str, str] = {"ROS 2 YAML": ".yaml", "CSV": ".csv", "npz":
 """Suffixes of files of the joints, by their names on the page."""
 
 
-def add_arm(gui: viser.GuiApi, bindings: Bindings, arms: Mapping[str, str], begin: Callable[..., None]) -> None:
-    """Build the controls where the panel is being built; for the titles of arms by name, and `ControlPanel.begin`."""
+def add_arm(
+    gui: viser.GuiApi,
+    bindings: Bindings,
+    arms: Mapping[str, str],
+    begin: Callable[..., None],
+    rewind: Callable[[Session], None],
+) -> None:
+    """Build the controls where the panel is being built.
+
+    For the titles of arms by name, and `ControlPanel.begin`; `rewind` shows what the robot did.
+    """
     names = {title: name for name, title in arms.items()}
     hint = "the arm: the task is placed in its reach, with all that is there; one that is new takes up to a minute"
     bindings.choice(
@@ -39,8 +49,10 @@ def add_arm(gui: viser.GuiApi, bindings: Bindings, arms: Mapping[str, str], begi
         lambda s: arms[s.arm],
         partial(begin, lambda session, title: session.choose_arm(names[title])),
     )
-    bindings.on(gui.add_button("Pause"), play_or_pause, label=lambda s: "Pause" if s.view.playing else "Play")
-    bindings.slider(gui, "speed")
+    robot = {"visible": lambda s: not s.view.replay}
+    label = lambda s: "Pause" if s.view.playing else "Play"  # noqa: E731
+    bindings.on(gui.add_button("Pause"), play_or_pause, label=label, **robot)
+    bindings.slider(gui, "speed", **robot)
 
     def stands(scenario: Scenario) -> bool:
         frame = bindings.frame
@@ -53,6 +65,9 @@ def add_arm(gui: viser.GuiApi, bindings: Bindings, arms: Mapping[str, str], begi
     push = gui.add_button("Push the hand", icon=viser.Icon.HAND_FINGER, disabled=True, hint=hint)
     bindings.on(push, lambda session, _pressed: session.engine.arm.push(), disabled=stands)
     bindings.checkbox(gui, "replay")
+    hint = f"plays its last {SPAN:.0f} s in a timeline, while it goes on"
+    past = gui.add_button("What the robot did", icon=viser.Icon.HISTORY, hint=hint)
+    bindings.on(past, lambda session, _pressed: rewind(session))
     hint = "by itself: the selected obstacle crosses the motion again and again, or the goal moves"
     buttons, rng = gui.add_button_group("Disturb", (*OBSTACLE_SPEEDS, GOAL), hint=hint), np.random.default_rng(0)
 

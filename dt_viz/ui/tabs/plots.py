@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import viser
@@ -13,15 +13,28 @@ from numpy.typing import NDArray
 from viser import uplot
 
 from dt_viz.flows.fields import Array
+from dt_viz.metrics import arc_length
+from dt_viz.motion.following import ArmMotion
 from dt_viz.motion.profiles import Profiles
 from dt_viz.robot.robot import Robot
-from dt_viz.session.engine import ArmMotion
+from dt_viz.session.frame import Frame
+from dt_viz.ui.bindings import Bindings
+from dt_viz.ui.playback import Replay
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.palette import Colour, css
 from dt_viz.ui.scene.picture import Following, Shown
 
-NUM_SAMPLES = 80
-"""Number of samples of a curve over time, few enough to be sent during a drag."""
+NUM_SAMPLES, RATE = 80, 10
+"""Number of samples of a curve over time, few enough to be sent during a drag, and of a long one for each second."""
+LARGE = 1.4
+"""Factor by which plots in windows of their own are higher."""
+WIDTH, BESIDE = 560.0, -350.0
+"""Width of these windows, and their place from the right, where the panel is, CSS pixels."""
+LEFT, RIGHT = 42, 12
+"""Room beside the curves of a plot, CSS pixels."""
+Axis = Literal["time", "path"]
+ACROSS: Mapping[Axis, str] = {"time": "t [s]", "path": "path"}
+"""Names of what is across the plots."""
 MAX_SPEED = 200
 """Largest speed in the plot, percent of the joint's limit: a joint that leaps would flatten all other curves."""
 
@@ -35,22 +48,46 @@ def small(text: str, *, tight: bool = False) -> str:
 
 
 def add_plot(
-    gui: viser.GuiApi, title: str, across: str, curves: Sequence[uplot.Series], height: int
+    gui: viser.GuiApi, title: str, axis: Axis, curves: Sequence[uplot.Series], height: float
 ) -> viser.GuiUplotHandle:
-    """Add an empty plot of curves below its title, which is HTML, where the panel is being built."""
+    """Add an empty plot of curves below its title, which is HTML, where the panel is being built.
+
+    It is marked at the moment that `cursor_html` tells.
+    """
     if title:
         gui.add_html(small(title, tight=True))
+    place = f"visibility:var(--dt-{axis}-seen,hidden);left:calc({LEFT}px + (100% - {LEFT + RIGHT}px)*var(--dt-{axis}))"
+    line = f"position:absolute;{place};top:16px;height:{height - 32}px;border-left:2px solid {css(palette.LIGHT.way)}"
+    gui.add_html(f"<div style='position:relative;z-index:1;height:0'><div style='{line}'></div></div>")
     font = "11px sans-serif"
     return gui.add_uplot(
         (np.zeros(2),) * (1 + len(curves)),
-        (uplot.Series(label=across), *curves),
+        (uplot.Series(label=ACROSS[axis]), *curves),
         scales={"x": {"time": False}},
-        axes=({"size": 26, "space": 40, "font": font}, {"size": 42, "space": 24, "font": font}),
+        axes=({"size": 26, "space": 40, "font": font}, {"size": LEFT, "space": 24, "font": font}),
         legend={"show": False},
         cursor={"drag": {"x": False, "y": False}},
-        height=height,
-        padding=(6, 12, 0, 0),
+        height=round(height),
+        padding=(6, RIGHT, 0, 0),
     )
+
+
+def cursor_html(**places: float | None) -> str:
+    """Return the style that marks plots at a part of each `Axis`, from 0 to 1, or not where that is None."""
+    marks = (
+        f"--dt-{axis}:{place:.4f};--dt-{axis}-seen:visible;" for axis, place in places.items() if place is not None
+    )
+    return f"<style>:root{{{''.join(marks)}}}</style>"
+
+
+def add_container(gui: viser.GuiApi, title: str, *, large: bool) -> tuple[Any, Any]:
+    """Add a folder, or a window over the scene, hidden; return what shows it, and what its content is built in."""
+    if not large:
+        folder = gui.add_folder(title, visible=False)
+        return folder, folder
+    panel = gui.add_panel(visible=False)
+    panel.float(x=BESIDE, y=15, width=WIDTH)
+    return panel, panel.add_tab(title)
 
 
 def curve(label: str, colour: Colour, *, width: float = 2, dashed: bool = False) -> uplot.Series:
@@ -90,8 +127,9 @@ class JointCurves:
     """(N, n) joint speeds, percent of the velocity limits."""
 
 
-def joint_curves(motion: ArmMotion, robot: Robot, num: int = NUM_SAMPLES) -> JointCurves:
+def joint_curves(motion: ArmMotion, robot: Robot) -> JointCurves:
     """Compute the curves; a speed is the largest around its moment, so that no peak is lost between two samples."""
+    num = max(NUM_SAMPLES, round(RATE * float(motion.times[-1] - motion.times[0])))
     times = np.linspace(motion.times[0], motion.times[-1], num)
     angles = np.stack([np.interp(times, motion.times, angle) for angle in np.degrees(motion.q).T], axis=1)
     steps = np.maximum(np.diff(motion.times), 1e-9)
@@ -103,17 +141,18 @@ def joint_curves(motion: ArmMotion, robot: Robot, num: int = NUM_SAMPLES) -> Joi
 
 
 class JointPlots(Following):
-    """A folder with the plots of the joints."""
+    """A folder, or a window, with the plots of the joints."""
 
-    def __init__(self, gui: viser.GuiApi) -> None:
-        """Make the folder, hidden, without curves until it takes a robot."""
-        folder = gui.add_folder("Joints", visible=False)
-        super().__init__(folder)
-        with folder:
+    def __init__(self, gui: viser.GuiApi, *, large: bool = False) -> None:
+        """Make it, hidden, without curves until it takes a robot."""
+        node, content = add_container(gui, "Joints", large=large)
+        super().__init__(node)
+        height, none = 170 * (LARGE if large else 1), (curve("", palette.LIGHT.arm_ring),)
+        with content:
             self._key = gui.add_html("")
-            self.angles = add_plot(gui, "Angle [°]; dashed: limits", "t [s]", (curve("", palette.LIGHT.arm_ring),), 170)
+            self.angles = add_plot(gui, "Angle [°]; dashed: limits", "time", none, height)
             title = f"Speed [% of its limit], up to {MAX_SPEED}; time [s]"
-            self.speeds = add_plot(gui, title, "t [s]", (curve("", palette.LIGHT.arm_ring),), 170)
+            self.speeds = add_plot(gui, title, "time", none, height)
 
     def take(self, robot: Robot) -> None:
         """Show a robot's motions from now on."""
@@ -127,25 +166,26 @@ class JointPlots(Following):
         marks = {f"{j}": f"background:{css(colour)}" for j, colour in enumerate(colours, start=1)}
         self._key.content = legend(marks, "0.3em", "Joint")
         for plot, curves in ((self.angles, (*joints, *limits)), (self.speeds, (*joints, limit))):
-            plot.series = (uplot.Series(label="t [s]"), *curves)
+            plot.series = (uplot.Series(label=ACROSS["time"]), *curves)
             plot.data = (np.zeros(2),) * (1 + len(curves))
 
     def _show(self, motion: ArmMotion) -> None:
         curves = joint_curves(motion, self._robot)
-        limits = np.tile(self._limits, (NUM_SAMPLES, 1))
+        limits = np.tile(self._limits, (len(curves.times), 1))
         self.angles.data = columns(curves.times, curves.angles, limits)
-        speeds, limit = np.minimum(curves.speeds, MAX_SPEED), np.full((NUM_SAMPLES, 1), 100.0)
+        speeds, limit = np.minimum(curves.speeds, MAX_SPEED), np.full((len(curves.times), 1), 100.0)
         self.speeds.data = columns(curves.times, speeds, limit)
 
 
 class HealthPlots(Shown):
-    """A folder with three plots and a table: the shown motion beside the one without avoidance and biases."""
+    """A folder, or a window, with three plots and a table: the shown motion beside the one without behaviours."""
 
-    def __init__(self, gui: viser.GuiApi) -> None:
+    def __init__(self, gui: viser.GuiApi, *, large: bool = False) -> None:
         self._drawn: Profiles | None = None
-        folder = gui.add_folder("Along the path", visible=False)
-        super().__init__(folder)
-        with folder:
+        node, content = add_container(gui, "Along the path", large=large)
+        super().__init__(node)
+        self._height = 130 * (LARGE if large else 1)
+        with content:
             self.table = gui.add_html("")
             line = f"border-top:2px {{}} {css(palette.LIGHT.arm_ring)}"
             marks = {"with avoidance and biases": line.format("solid"), "without": line.format("dashed")}
@@ -159,7 +199,7 @@ class HealthPlots(Shown):
 
     def _plot(self, gui: viser.GuiApi, title: str, colour: Colour, *more: uplot.Series) -> viser.GuiUplotHandle:
         without = curve("without", colour, width=1.5, dashed=True)
-        return add_plot(gui, title, "path", (curve("shown", colour), without, *more), 130)
+        return add_plot(gui, title, "path", (curve("shown", colour), without, *more), self._height)
 
     def draw(self, profiles: Profiles | None) -> None:
         """Show these profiles; None leaves what is there."""
@@ -181,6 +221,68 @@ class HealthPlots(Shown):
             clearances = 1e3 * shown.clearance, 1e3 * without.clearance
             self.clearance.data = columns(along, *clearances, np.zeros(len(along)))
         self.table.content = table_html(profiles)
+
+
+class Plots:
+    """All plots of one visitor: each below its checkbox, or, large, in a window."""
+
+    def __init__(self, gui: viser.GuiApi, bindings: Bindings) -> None:
+        """Build them with their checkboxes where the panel is being built."""
+        self.joints: list[JointPlots] = []
+        self.health: list[HealthPlots] = []
+        self._robot: Robot | None = None
+        self._motion: ArmMotion | None = None
+        self._path: Array | None = None
+        """Path of the hand (T, 3) along which the health is plotted, metres."""
+        self._past: ArmMotion | None = None
+        """What the robot did, while that is shown."""
+        for name, kind, made in (("joint_plots", JointPlots, self.joints), ("health_plots", HealthPlots, self.health)):
+            bindings.checkbox(gui, name)
+            for large in (False, True):
+                shown = lambda s, name=name, large=large: getattr(s.view, name) and s.view.large_plots == large  # noqa: E731
+                made.append(bindings.properties(kind(gui, large=large), visible=shown))
+        bindings.checkbox(gui, "large_plots", visible=lambda s: s.view.joint_plots or s.view.health_plots)
+
+    def take(self, robot: Robot) -> None:
+        """Show a robot's motions from now on."""
+        self._robot, self._motion, self._path, self._past = robot, None, None, None
+        for plots in self.joints:
+            plots.take(robot)
+
+    def draw(self, frame: Frame) -> None:
+        """Show a frame."""
+        self._motion = frame.arm or self._motion
+        path = frame.rollouts[frame.chosen] if frame.chosen is not None and len(frame.rollouts) else ()
+        self._path = path if len(path) > 1 else None
+        self._draw_joints()
+        for plots in self.health:
+            plots.draw(frame.profiles)
+
+    def mark(self, player: Replay | None, *, past: bool = False) -> str:
+        """Show what the robot did, if it is that which is played, on the joints' plots.
+
+        Returns:
+            HTML that marks the plots at the moment that is played.
+        """
+        motion = None if player is None else player.motion
+        before, self._past = self._past, motion if past else None
+        if before is not self._past:
+            self._draw_joints()
+        q, path, robot = None if player is None else player.q, self._path, self._robot
+        if player is None or q is None or robot is None:
+            return cursor_html()
+        place = place_along(path, robot.end_effector(q)) if path is not None and player.seeks else None
+        return cursor_html(time=player.moment / max(player.duration, 1e-9), path=place)
+
+    def _draw_joints(self) -> None:
+        for plots in self.joints:
+            plots.follow(self._past or self._motion)
+
+
+def place_along(path: Array, place: Array) -> float:
+    """Return the part of a path (T, 3), from 0 to 1, at whose end is what is nearest to a place (3,), metres."""
+    length = arc_length(path)
+    return float(length[np.linalg.norm(path - place, axis=1).argmin()] / max(length[-1], 1e-9))
 
 
 def table_html(profiles: Profiles) -> str:

@@ -12,7 +12,8 @@ from dt_viz.session.frame import Frame
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import KEEP, Bindings
 from dt_viz.ui.scene.legend import OCCUPANCY, Legend, legend_of
-from dt_viz.ui.tabs.plots import HealthPlots, JointPlots, small
+from dt_viz.ui.tabs.plots import Plots, small
+from dt_viz.ui.tabs.timeline import Timeline
 
 WHOLE_ARM_NOTE = "The slice shows the stack of the hand's path; what the whole arm avoids with is not in it."
 IN_SCENE = (
@@ -41,11 +42,8 @@ class ShowTab:
         self.legend: Legend | None = None
         """Legend of the colours that are shown on the slice."""
         self._add_slice(gui, bindings)
-        # each plot under its checkbox, high up in the tab, to be seen when it opens
-        bindings.checkbox(gui, "joint_plots")
-        self.joints = bindings.properties(JointPlots(gui), visible=lambda s: s.view.joint_plots)
-        bindings.checkbox(gui, "health_plots")
-        self.health = bindings.properties(HealthPlots(gui), visible=lambda s: s.view.health_plots)
+        self.plots = Plots(gui, bindings)  # high up in the tab, to be seen when it opens
+        self.timeline = Timeline(gui, bindings, self.plots)
         for name in IN_SCENE:
             if name == "panels":
                 box = gui.add_checkbox(OFFERS[name].label, False, hint=OFFERS[name].hint)
@@ -57,8 +55,7 @@ class ShowTab:
 
     def draw(self, frame: Frame) -> None:
         """Show a frame in the plots."""
-        self.joints.follow(frame.arm)
-        self.health.draw(frame.profiles)
+        self.plots.draw(frame)
 
     def _add_slice(self, gui: viser.GuiApi, bindings: Bindings) -> None:
         """Add the controls of the slice, with a legend of its colours."""
