@@ -25,8 +25,12 @@ UNHURRIED = """
         const draw = WebGL2RenderingContext.prototype[name];
         WebGL2RenderingContext.prototype[name] = function(...given) { if (window.isLookedAt) draw.apply(this, given); };
     }
+    const still = new CSSStyleSheet();
+    still.replaceSync('*, ::before, ::after {animation: none !important}');
+    document.adoptedStyleSheets.push(still);
 """
-"""Five frames a second are enough, and no pixels where `isLookedAt` is not set: drawing by software takes whole cores.
+"""Five frames a second are enough, no pixels where `isLookedAt` is not set, and no spinners: drawing by software takes
+whole cores.
 
 Timers also run where the browser gives no frames for a while, as after a change of the window's size. What is clicked
 or dragged is found by rays through the scene's triangles, which needs no pixels.
