@@ -23,6 +23,11 @@ class History:
         self.held = False
         """Whether something is held, so that the gesture goes on however slow it is."""
 
+    @property
+    def steps(self) -> tuple[bool, bool]:
+        """Whether there is something to undo, and to redo."""
+        return bool(self._past), bool(self._future)
+
     def begin_gesture(self) -> None:
         """The user took hold of something."""
         self._gesture, self.held = ("", 0.0), True
