@@ -21,10 +21,19 @@ LIGHT = View(handles=True, **dict.fromkeys(HIDDEN, False))
 UNHURRIED = """
     window.requestAnimationFrame = callback => setTimeout(() => callback(performance.now()), 200);
     window.cancelAnimationFrame = clearTimeout;
+    for (const name of ['clear', 'drawArrays', 'drawArraysInstanced', 'drawElements', 'drawElementsInstanced']) {
+        const draw = WebGL2RenderingContext.prototype[name];
+        WebGL2RenderingContext.prototype[name] = function(...given) { if (window.isLookedAt) draw.apply(this, given); };
+    }
+    const still = new CSSStyleSheet();
+    still.replaceSync('*, ::before, ::after {animation: none !important}');
+    document.adoptedStyleSheets.push(still);
 """
-"""Five pictures a second are enough: a page is drawn all the time, and by software that takes a whole core.
+"""Five frames a second are enough, no pixels where `isLookedAt` is not set, and no spinners: drawing by software takes
+whole cores.
 
-Timers also run where the browser gives no frames for a while, as after a change of the window's size.
+Timers also run where the browser gives no frames for a while, as after a change of the window's size. What is clicked
+or dragged is found by rays through the scene's triangles, which needs no pixels.
 """
 
 

@@ -49,13 +49,13 @@ async def visit_and_stop(process, url, number):
     "number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)], ids=["SIGTERM", "Ctrl-C"]
 )
 def test_a_signal_ends_it_cleanly_while_visitors_drag(cache, number):
-    with started(cache) as process:
+    with started(cache, "--processes", "1") as process:
         asyncio.run(visit_and_stop(process, address(process), number))
         assert_ends_cleanly(process)
 
 
 def test_a_signal_ends_it_cleanly_while_it_learns(tmp_path):
-    with started(tmp_path) as process:
+    with started(tmp_path, "--processes", "1") as process:
         address(process)  # it answers meanwhile
         assert process.stdout is not None
         assert "Learn" in process.stdout.read(8)

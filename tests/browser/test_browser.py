@@ -241,8 +241,10 @@ def test_the_saved_png_has_the_chosen_size_and_is_not_blank(visit):
     visitor.session.edit("test", view=replace(LIGHT, rollouts=True, arm=True, table=True, colour="det"))
     assert visitor.session.wait_idle(PATIENCE)
     open_tab(page, "Picture")
+    page.evaluate("isLookedAt = true")
     with page.expect_download() as download:
         press(page.get_by_text("Save picture"))
+    page.evaluate("isLookedAt = false")
     image = Image.open(io.BytesIO(download.value.path().read_bytes()))
     assert image.size == (1280, 720)
     assert image.mode == "RGB"

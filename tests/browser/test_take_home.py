@@ -42,6 +42,7 @@ def test_a_page_plays_without_server_and_network(browser, tmp_path, cache, monke
 
     began = moment.input_value()
     wait_until(lambda: moment.input_value() != began, "the motion to go on")  # it plays by itself
+    page.evaluate("isLookedAt = true")
     first, middle = seen(0.05), seen(0.5)
     assert first.std() > 10
     changed = np.abs(middle - first).max(axis=2) > 40

@@ -85,6 +85,7 @@ def kill_a_busy_worker(address, killed):
             time.sleep(0.01)
 
 
+@pytest.mark.slow
 def test_a_cluster_that_loses_a_worker_writes_what_one_process_does(commands, cluster, tmp_path):
     alone, killed = run(commands["around"], tmp_path / "alone"), []
     killer = threading.Thread(target=kill_a_busy_worker, args=(cluster.scheduler_address, killed))
@@ -95,24 +96,31 @@ def test_a_cluster_that_loses_a_worker_writes_what_one_process_does(commands, cl
     assert len(killed) == 1
 
 
-@pytest.mark.slow
-def test_an_item_that_ends_its_worker_is_computed_again_and_one_that_ends_each_is_given_up(
-    cluster, tmp_path, monkeypatch
-):
-    def once(_, k):
-        if k == 1 and not (tmp_path / "ended").exists():
+def test_an_item_that_ends_its_worker_is_computed_again_as_one_process_does(cluster, tmp_path):
+    matrices = [np.random.default_rng(k).normal(size=(90, 90)) for k in range(5)]
+
+    def product(_, matrix):
+        if matrix[0, 0] == matrices[1][0, 0] and not (tmp_path / "ended").exists():
             (tmp_path / "ended").touch()
             os.kill(os.getpid(), signal.SIGKILL)
-        return k, os.getpid()
+        return os.getpid(), (matrix @ matrix).tobytes()
 
+    with sweep(options(dask=cluster.scheduler_address), lambda: None) as (_, swept):
+        pids, products = zip(*swept(product, matrices), strict=True)
+    assert (tmp_path / "ended").exists() and os.getpid() not in pids
+    assert [*products] == [(matrix @ matrix).tobytes() for matrix in matrices]
+
+
+@pytest.mark.slow
+def test_an_item_that_ends_each_worker_is_given_up_and_workers_with_other_threads_are_refused(cluster, monkeypatch):
     def always(_, k):
         os.kill(os.getpid(), signal.SIGKILL)
 
-    with sweep(options(dask=cluster.scheduler_address), lambda: None) as (_, swept):
-        found = [*swept(once, range(5))]
-        assert [k for k, _ in found] == [0, 1, 2, 3, 4] and os.getpid() not in dict(found).values()
-        with pytest.raises(FormatError, match="--dask: found a cluster that gave up"):
-            list(swept(always, range(1)))
+    with (
+        sweep(options(dask=cluster.scheduler_address), lambda: None) as (_, swept),
+        pytest.raises(FormatError, match="--dask: found a cluster that gave up"),
+    ):
+        list(swept(always, range(1)))
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "3")  # which would round otherwise
     with (
         sweep(options(dask=cluster.scheduler_address), lambda: None) as (_, swept),

@@ -70,6 +70,7 @@ class ReadingProcess:
 
 @contextmanager
 def reading(*arguments: str) -> Iterator[ReadingProcess]:
+    """The program, after it has read all good files."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "OMP_NUM_THREADS": "1"}
     environment["OPENBLAS_NUM_THREADS"] = "1"
     command = [sys.executable, "-W", "error", hostile.__file__, *arguments]
@@ -78,7 +79,12 @@ def reading(*arguments: str) -> Iterator[ReadingProcess]:
         environment["TMPDIR"] = folder
         with subprocess.Popen(command, env=environment, stdin=pipe, stdout=pipe, stderr=pipe) as process:
             try:
-                yield ReadingProcess(process)
+                program = ReadingProcess(process)
+                for kind, name, content, _ in seeds():  # what compiles kernels for this Python is not the files' time
+                    assert program.read(kind, name, content).message == ""
+                assert program.read("scenario", "a.json", GOOD.encode()).message == ""
+                yield program
+                assert program.end() < MAX_WORKER
             finally:
                 process.kill()
 
@@ -91,32 +97,28 @@ def check(outcome: Outcome, name: str) -> None:
     assert outcome.seconds < MAX_SECONDS
 
 
-def read_all(numbers: Collection[int], max_growth: float, *arguments: str) -> None:
+@pytest.fixture(scope="module")
+def program():
+    """A process for all files but those that are mapped finely."""
+    with reading("--coarse") as process:
+        yield process
+
+
+def read_all(process: ReadingProcess, numbers: Collection[int], max_growth: float) -> None:
     num, outcomes = len(numbers), []
-    with reading(*arguments) as process:
-        for kind, name, content, _ in seeds():  # what compiles kernels for this Python is not the files' time
-            process.read(kind, name, content)
-        for number in numbers:
-            kind, name, content = hostile_file(number)
-            outcome = process.read(kind, name, content)
-            check(outcome, name)
-            assert outcome.growth < max_growth, f"file {number}, {kind} {name}: {outcome}"
-            if outcome.seconds > USUAL_SECONDS:
-                print(f"file {number}, {kind} {name}, {len(content)} bytes: {outcome}")
-            outcomes.append(outcome)
-        worker = process.end()
-    assert worker < MAX_WORKER
+    for number in numbers:
+        kind, name, content = hostile_file(number)
+        outcome = process.read(kind, name, content)
+        check(outcome, name)
+        assert outcome.growth < max_growth, f"file {number}, {kind} {name}: {outcome}"
+        if outcome.seconds > USUAL_SECONDS:
+            print(f"file {number}, {kind} {name}, {len(content)} bytes: {outcome}")
+        outcomes.append(outcome)
     num_read = sum(not outcome.message for outcome in outcomes)
     slowest, largest = max(o.seconds for o in outcomes), max(o.growth for o in outcomes)
-    print(f"{num_read} of {num} were read; at most {slowest:.1f} s, {largest:.0f} MB and {worker:.0f} MB")
+    print(f"{num_read} of {num} were read; at most {slowest:.1f} s, {largest:.0f} MB")
     assert sum(outcome.seconds > USUAL_SECONDS for outcome in outcomes) < 0.05 * num
     assert 0.02 * num < num_read < 0.9 * num  # the mutations are neither all fatal nor all harmless
-
-
-def test_the_good_files_are_read():
-    with reading("--coarse") as process:
-        for kind, name, content, _ in seeds():
-            assert process.read(kind, name, content).message == ""
 
 
 def bzip2_member() -> bytes:
@@ -212,34 +214,27 @@ ATTACKS = {
 """Loader, name and content of a file, and words of its refusal."""
 
 
-@pytest.fixture(scope="module")
-def attacked():
-    """A process for all attacks."""
-    with reading("--coarse") as process:
-        yield process
-        assert process.end() < MAX_WORKER
-
-
 @pytest.mark.parametrize("attack", ATTACKS)
-def test_what_takes_gigabytes_is_refused_in_the_readers_process(attacked, attack):
+def test_what_takes_gigabytes_is_refused_in_the_readers_process(program, attack):
     kind, name, make, words = ATTACKS[attack]
-    outcome = attacked.read(kind, name, make())
+    outcome = program.read(kind, name, make())
     print(outcome)
     assert words in outcome.message
     assert outcome.growth < MAX_GROWTH
     check(outcome, name)
 
 
-def test_mutated_files_are_read_or_refused():
+def test_mutated_files_are_read_or_refused(program):
     """Two of each kind, and thirty of those that are read in the user's own process."""
     kinds = [kind for kind, *_ in seeds()]
     own = (k for k in range(30 * len(kinds)) if k < 2 * len(kinds) or kinds[k % len(kinds)] == "demonstrations")
-    read_all([*own], MAX_GROWTH, "--coarse")
+    read_all(program, [*own], MAX_GROWTH)
 
 
 @pytest.mark.slow
 def test_very_many_mutated_files_are_read_or_refused():
-    read_all(range(3000), MAX_GROWTH_FINE)
+    with reading() as process:
+        read_all(process, range(3000), MAX_GROWTH_FINE)
 
 
 # --- saved scenarios ---
@@ -285,15 +280,15 @@ BOMBS = {
 
 
 @pytest.mark.parametrize("text", BOMBS.values(), ids=BOMBS)
-def test_a_bomb_for_a_scenario_is_refused_at_once_in_little_memory(text, scenarios):
+def test_a_bomb_for_a_scenario_is_refused_at_once_in_little_memory(text, program):
     assert len(text) <= 3 * MAX_BYTES
-    outcome = scenarios.read("scenario", "a.json", text.encode())
+    outcome = program.read("scenario", "a.json", text.encode())
     check(outcome, "a.json")
     assert outcome.message and outcome.growth < MAX_SCENARIO_GROWTH and outcome.seconds < MAX_SCENARIO_SECONDS
 
 
-def test_five_hundred_damaged_scenarios_are_refused_by_a_field_or_read_exactly(scenarios):
-    outcomes = [scenarios.read("scenario", "a.json", hostile_scenario(number)) for number in range(500)]
+def test_five_hundred_damaged_scenarios_are_refused_by_a_field_or_read_exactly(program):
+    outcomes = [program.read("scenario", "a.json", hostile_scenario(number)) for number in range(500)]
     for outcome in outcomes:
         check(outcome, "a.json")
         assert outcome.growth < MAX_SCENARIO_GROWTH and outcome.seconds < MAX_SCENARIO_SECONDS, outcome
@@ -301,10 +296,3 @@ def test_five_hundred_damaged_scenarios_are_refused_by_a_field_or_read_exactly(s
     slowest, largest = max(o.seconds for o in outcomes), max(o.growth for o in outcomes)
     print(f"{num_read} of 500 were read; at most {slowest:.2f} s, {largest:.0f} MB")
     assert 10 < num_read < 400
-
-
-@pytest.fixture(name="scenarios", scope="module")
-def _scenarios():
-    with reading("--coarse") as process:
-        assert not process.read("scenario", "a.json", GOOD.encode()).message
-        yield process

@@ -38,11 +38,10 @@ def npy(array):
     return file.getvalue()
 
 
-@pytest.mark.parametrize("process", [False, True])
-def test_several_files_and_an_archive_of_their_folder_give_the_same_takes(process):
+def test_several_files_and_an_archive_of_their_folder_give_the_same_takes():
     files = {f"take_{k}.csv": table(HEADER, [TIMES, *path_of(k).T]) for k in range(3)}
     archive = zipped({f"takes/day/{name}": content for name, content in files.items()} | {"__MACOSX/._a.csv": b"?"})
-    one, other = read(*files.items(), process=process), read(("all.zip", archive), process=process)
+    one, other = read(*files.items()), read(("all.zip", archive), process=True)
     assert [take.name for take in one.takes] == [take.name for take in other.takes] == ["take_0", "take_1", "take_2"]
     for k, (take, same) in enumerate(zip(one.takes, other.takes, strict=True)):
         np.testing.assert_array_equal(take.positions, path_of(k))
@@ -50,12 +49,11 @@ def test_several_files_and_an_archive_of_their_folder_give_the_same_takes(proces
     assert one.refused == other.refused == one.notes == other.notes == ()
 
 
-@pytest.mark.parametrize("process", [False, True])
-def test_joint_angles_orientations_and_missing_times_come_through(process):
+def test_joint_angles_orientations_and_missing_times_come_through():
     turns = np.tile([0.0, 0.0, 0.0, 1.0], (60, 1))
     poses = table(("x", "y", "z", "qx", "qy", "qz", "qw"), [*path_of().T, *turns.T])
     angles = table(["t", *(f"{name}.pos" for name in JOINT_NAMES), "gripper.pos"], np.eye(8))
-    found = read(("a.csv", poses), ("b.npy", npy(np.zeros((50, 6)))), ("c.csv", angles), process=process)
+    found = read(("a.csv", poses), ("b.npy", npy(np.zeros((50, 6)))), ("c.csv", angles), process=True)
     assert not found.takes[0].is_timed and found.takes[0].orientations is not None
     np.testing.assert_array_equal(found.takes[0].orientations, np.roll(turns, 1, axis=1))
     assert found.takes[1].positions is None and found.takes[1].joint_names[:2] == ("joint1", "joint2")

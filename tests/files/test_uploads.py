@@ -47,11 +47,15 @@ def reader(tmp_path, monkeypatch):
     return replace
 
 
-def test_arrays_and_notes_come_back():
-    read = read_upload(Triangles, [("a.stl", BOX)])
-    assert read.vertices.shape == (8, 3) and read.faces.shape == (12, 3) and read.notes == ()
+@pytest.fixture
+def kept():
+    """One process reads all the test's files, unless it is ended."""
+    uploads.keep_ready(user := object())
+    yield
+    uploads.let_go(user)
 
 
+@pytest.mark.usefixtures("kept")
 def test_what_is_refused_says_why_in_one_line():
     with pytest.raises(FormatError, match="faces: found none"):
         read_upload(Triangles, [("a.obj", b"v 0 0 0\n")])
@@ -60,16 +64,14 @@ def test_what_is_refused_says_why_in_one_line():
 
 
 @LINUX
-@pytest.mark.parametrize("ending", ["", "os.abort()"], ids=["read", "ends its reader"])
-def test_the_readers_processor_time_is_charged_to_whoever_sent_the_file(reader, ending):
-    reader(f"while time.process_time() < 0.5: pass\n{ending}")
+@pytest.mark.usefixtures("kept")
+def test_the_readers_processor_time_is_charged_to_whoever_sent_the_file(reader):
+    reader("while time.process_time() < 0.5: pass\nif files[0][1] == b'end': os.abort()")
     account = Account(None, QuotaSettings(rate=1e-9, saved=0.0))
-    uploads.keep_ready(account)
-    for number in (1, 2):  # by one process, unless that has ended
+    for number, content in enumerate((b"", b"end", b""), 1):  # the last one by another process
         with charged(account), pytest.raises((FormatError, KeyError)):
-            read_upload(Triangles, [("a.stl", BOX)])
+            read_upload(Triangles, [("a.stl", content)])
         assert 0.5 * number <= account.debt < 0.5 * number + 0.4
-    uploads.let_go(account)
 
 
 @LINUX
@@ -102,24 +104,23 @@ def test_a_reader_that_ends_its_parent_is_ended_with_it(reader, tmp_path):
     wait_until(lambda: not leftovers._read(leftovers.PROC / file.read_text() / "cmdline"))
 
 
-@pytest.mark.parametrize(
-    "answer",
-    [
-        "print(3, flush=True), []",
-        "[], []",
-        "{}, []",
-        "{'refused': 3}, []",
-        "{'value': {}, 'arrays': []}, []",
-        "{'value': {}, 'arrays': ['a']}, []",
-    ],
-)
-def test_any_other_answer_is_one_line_for_the_page(reader, answer):
-    reader(f"return {answer}")
-    with pytest.raises(ShapeError) as info:
-        read_mesh(BOX, "a.stl")
-    assert str(info.value).startswith("a.stl: file: found ")
+@pytest.mark.usefixtures("kept")
+def test_any_other_answer_is_one_line_for_the_page(reader):
+    reader("return eval(files[0][1])")
+    for answer in (
+        b"print(3, flush=True), []",
+        b"[], []",
+        b"{}, []",
+        b"{'refused': 3}, []",
+        b"{'value': {}, 'arrays': []}, []",
+        b"{'value': {}, 'arrays': ['a']}, []",
+    ):
+        with pytest.raises(ShapeError) as info:
+            read_mesh(answer, "a.stl")
+        assert str(info.value).startswith("a.stl: file: found "), answer
 
 
+@pytest.mark.usefixtures("kept")
 def test_nothing_is_unpickled_and_no_room_is_made_for_what_is_not_there(reader):
     reader("""
         header = {"descr": "<f8", "fortran_order": False, "shape": (10**12, 3)}
@@ -194,7 +195,8 @@ def test_one_is_kept_while_somebody_may_send_a_file_and_none_is_left():
     for user in users:
         uploads.keep_ready(user)
     assert uploads._ready._process is None  # before the first file
-    read_upload(Triangles, [("a.stl", BOX)])
+    read = read_upload(Triangles, [("a.stl", BOX)])
+    assert read.vertices.shape == (8, 3) and read.faces.shape == (12, 3) and read.notes == ()
     ready = uploads._ready._process
     assert ready is not None
     assert [path.name for path in Path(str(ready._folder)).iterdir()] == ["said"]  # the file has gone

@@ -432,6 +432,9 @@ def test_a_link_begins_its_task_afresh_also_where_that_is_what_was_kept_and_undo
     assert kept(page.client.local_storage).scenario == page.session.scenario
     page.session.undo()
     assert page.session.scenario.choices == MADE.choices
+    page.visitor.told(Link("scene", "fig-4"))
+    assert page.session.jobs.wait_idle(CHOICES, PATIENCE)
+    assert (page.session.scenario.scene, page.session.scenario.task) == ("two_points", "draw_j")
 
 
 # --- the camera ---
