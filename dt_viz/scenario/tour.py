@@ -22,7 +22,7 @@ DIAMETER = 0.15
 """Diameter of the sphere, metres."""
 BIAS_AT, BIAS_OFFSET = 20, (-0.05, 0.04)
 """Percent of the mean demonstration's length beside which the bias point lies, and how far, right and up, metres."""
-NEW_STARTS = ((-0.9, 0.2), (-0.5, -0.9), (0.5, 0.95), (0.9, -0.3))
+NEW_STARTS = ((-0.9, 0.6), (-0.3, -0.9), (0.4, 0.9), (0.9, 0.2))
 """Places of added starts on the slice, right and up, relative to half its size."""
 FLAT = {"arm": False, "table": False, "ghost": False}
 """View of the steps that are about the hand alone."""

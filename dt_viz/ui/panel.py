@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -83,7 +83,7 @@ class ControlPanel:
         `open_scenario` goes on with the scenario of a file if it holds one. A visitor teaches with the `pen`.
         The browser's `storage` keeps where the visitor is in the tour, at whose end `came_back` is called; see `Tour`.
         """
-        self._notify, self._begin_anew, self._titles = notify, (tripod.view, forget), dict(titles)
+        self._notify, self._titles = notify, dict(titles)
         self._notified: Message | None = None
         self._scenes = {scene.title: scene for scene in offered(self._titles)}
         self.bindings = bindings = Bindings()
@@ -99,7 +99,8 @@ class ControlPanel:
         self.hint = gui.add_html(hint_html(""))
         add_avoid_and_imitate(gui, bindings)
         self.status = StatusLine(gui, bindings)
-        travels = {"Undo": Session.undo, "Redo": Session.redo, "Reset": self._reset, "Save": save}
+        reset = partial(self._reset, (tripod.view, forget))
+        travels = {"Undo": Session.undo, "Redo": Session.redo, "Reset": reset, "Save": save}
         buttons = gui.add_button_group("History", tuple(travels), hint=SAVE_HINT)
         bindings.on(buttons, lambda session, button: travels[button](session))
         gui.add_html("<style>[data-dock-tab] { padding: 0 0.45em !important }</style>")  # all tabs lie in one row
@@ -120,7 +121,7 @@ class ControlPanel:
         with tabs.add_tab("Picture"):
             act = {"darken": darken, "enlarge": enlarge, "render": render, "draw": self._draw, "record": record}
             picture = PictureTab(gui, bindings, tripod, self.presentation, send=send, **act)
-        commands = self._commands(gui.main_panel, picture, save, opening)
+        commands = self._commands(gui.main_panel, picture, reset, save, opening)
         add_commands(gui, bindings, commands)
         add_about(gui, bindings, commands, self.tour.take)
         self.take(robot)
@@ -286,6 +287,7 @@ class ControlPanel:
         self,
         panel: Any,  # noqa: ANN401 - viser's, without a name
         picture: PictureTab,
+        reset: Callable[[Session], None],
         save: Callable[[Session], None],
         opening: OpenPanel,
     ) -> list[Command]:
@@ -305,7 +307,7 @@ class ControlPanel:
 
         return [
             Command("Pause, or play", play_or_pause, "space"),
-            Command("Reset the scene and the camera", self._reset, "R"),
+            Command("Reset the scene and the camera", reset, "R"),
             Command("Undo", Session.undo, "Z"),
             Command("Redo", Session.redo, "Z", shifted=True),
             Command("Save the scenario as a file", save),
@@ -317,12 +319,13 @@ class ControlPanel:
             *numbered(tuple(self._scenes), partial(self.begin, self._load)),
         ]
 
-    def _reset(self, session: Session) -> None:
+    def _reset(self, begin_anew: Iterable[Callable[[], None]], session: Session) -> None:
+        """Reset the session, and what else begins anew; in the tour, begin the step anew."""
         if self.tour.step is not None:
             self.tour.turn(session, 0)
             return
         session.reset()
-        for begin in self._begin_anew:
+        for begin in begin_anew:
             begin()
 
 

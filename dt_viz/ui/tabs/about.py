@@ -97,8 +97,8 @@ def legend_html() -> str:
 def keys_html(commands: Sequence[Command]) -> str:
     """Return the keys of the commands; the scenes on the digits are one line."""
     keys = {command.keys: command.label for command in commands if command.key and not command.key.isdecimal()}
-    keys |= {"← →": "previous and next step of the tour"}
-    keys |= {"1 – 9": "scenes, in their order", "Ctrl K": "all commands by name"}
+    keys |= {"← →": "previous and next step of the tour", "1 – 9": "scenes, in their order"}
+    keys |= {"Ctrl K": "all commands by name"}
     rows = "".join(
         f"<tr><td style='white-space:nowrap;padding-right:0.9em;font-weight:600'>{key}</td>"
         f"<td>{html.escape(text)}</td></tr>"

@@ -15,6 +15,7 @@ from dt_viz.ui import keeping
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.keeping import Storage
 from dt_viz.ui.scene.camera import CameraController, Pose
+from dt_viz.ui.scene.palette import LIGHT, css
 from dt_viz.ui.scripts import arrows_html
 from dt_viz.ui.tabs.plots import small
 from dt_viz.ui.tabs.stack import PLAY, add_warp
@@ -23,6 +24,8 @@ TAKE, DECLINE = "Take the tour", "No, thanks"
 BACK, NEXT, END = "Back", "Next", "End"
 KEY = "dt-viz-tour"
 """Name under which a browser keeps the number of the step that is shown, from 1, or `OVER`."""
+PAPER = "rgba(0, 158, 115, 0.10)"
+"""Colour behind the text, on light and on dark."""
 OVER = "over"
 """Text that a browser keeps once the tour is ended or declined."""
 NUMBERS = tuple(str(number) for number in range(1, len(STEPS) + 1))
@@ -193,4 +196,5 @@ def card_html(step: TourStep, number: int) -> str:
     title = f"<b>{number + 1} of {len(STEPS)} · {html.escape(step.title)}</b>"
     formula = f"<div style='text-align:center;padding:0.3em;font-size:1.15em'>{step.formula}</div>"
     trial = f"<b>Try:</b> {html.escape(step.trial)}"
-    return small(f"<div role='note'>{title}<br/>{html.escape(step.text)}{formula}{trial}</div>")
+    style = f"margin:0 -0.2em;padding:0.5em 0.7em;border-left:3px solid {css(LIGHT.goal)};background:{PAPER}"
+    return small(f"<div role='note' style='{style}'>{title}<br/>{html.escape(step.text)}{formula}{trial}</div>")
