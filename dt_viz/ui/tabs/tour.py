@@ -23,7 +23,7 @@ from dt_viz.ui.tabs.stack import PLAY, add_warp
 TAKE, DECLINE = "Take the tour", "No, thanks"
 BACK, NEXT, END = "Back", "Next", "End"
 KEY = "dt-viz-tour"
-"""Name under which a browser keeps the number of the step that is shown, from 1, or `OVER`."""
+"""Key under which a browser keeps the number of the step that is shown, from 1, or `OVER`."""
 PAPER = "rgba(0, 158, 115, 0.10)"
 """Colour behind the text, on light and on dark."""
 OVER = "over"
@@ -33,6 +33,7 @@ NUMBERS = tuple(str(number) for number in range(1, len(STEPS) + 1))
 LANE = "tour"
 """Lane of the session's jobs on which the browser is asked, and the tour begins."""
 Begin = Callable[[Callable[[Session, str], None], Session, str], None]
+"""Function that begins something of a session, with a title; see `ControlPanel.choose`."""
 
 
 class Tour:
@@ -83,7 +84,7 @@ class Tour:
             session.jobs.submit(LANE, partial(self._ask, session, self._storage))
 
     def take(self, session: Session, number: int = 0) -> None:
-        """Go to a step, from 0; it must not be called from the lane `CHOICES`."""
+        """Begin the tour at a step, from 0, or go to it."""
         if self.number is None:
             session.jobs.submit(LANE, partial(self._enter, session, number), latest=True)
         else:
