@@ -130,9 +130,10 @@ def test_the_camera_is_where_it_was(opened):
     camera = page.visitor._camera
     camera.look(page.session.task)
     camera.view("Top")
-    before = camera.chosen
+    settled(page)
+    before, kept = camera.chosen, page.client.local_storage[MADE_KEY]
     press(page, "New here?", TAKE)
-    assert camera.chosen is None
+    assert camera.chosen is None and page.client.local_storage[MADE_KEY] == kept
     press(page, "Step", END)
     sight = page.visitor._keeper.begun
     assert sight is not None and sight.scenario is page.session.scenario
