@@ -105,6 +105,7 @@ class CameraClient:
         self.camera = SimpleNamespace(
             position=np.array([0.8, -1.6, 0.8]),
             look_at=np.zeros(3),
+            wxyz=np.array([1.0, 0.0, 0.0, 0.0]),
             fov=0.75,
             image_width=1280,
             image_height=720,

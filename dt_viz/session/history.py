@@ -44,6 +44,11 @@ class History:
         self._aside, self._gesture, self.held = None, ("", 0.0), False
         return own
 
+    @property
+    def steps(self) -> tuple[bool, bool]:
+        """Whether there is something to undo, and to redo."""
+        return bool(self._past), bool(self._future)
+
     def begin_gesture(self) -> None:
         """The user took hold of something."""
         self._gesture, self.held = ("", 0.0), True

@@ -60,6 +60,8 @@ class Progress:
     message: Message | None = None
     restored: Scenario | None = None
     """The scenario that was found in the browser; None if none was."""
+    steps: tuple[bool, bool] = (False, False)
+    """Whether there is something to undo, and to redo."""
 
     @property
     def stale(self) -> bool:
@@ -113,12 +115,12 @@ class Screen:
         self._live_frames: deque[float] = deque(maxlen=120)
         """Times of the newest frames of stage LIVE, of `time.perf_counter`."""
 
-    def adopt(self, newest: Callable[[], Scenario]) -> None:
-        """Show the newest scenario, asked for in its turn, on the controls: it is wanted now."""
+    def adopt(self, newest: Callable[[], tuple[Scenario, tuple[bool, bool]]]) -> None:
+        """Show the newest scenario, asked for in its turn with `Progress.steps`, on the controls: it is wanted now."""
         with self._adopting:
-            wanted = newest()
+            wanted, steps = newest()
             self._display.adopt(wanted)
-            self.tell(wanted=wanted)
+            self.tell(wanted=wanted, steps=steps)
 
     def tell(self, **changes: Any) -> None:  # noqa: ANN401 - the fields of Progress
         """Change the progress and show it."""

@@ -340,7 +340,7 @@ class Session:
 
     def _adopt(self) -> None:
         self._unadopted = False
-        self._screen.adopt(lambda: self.scenario)
+        self._screen.adopt(lambda: (self.scenario, self._history.steps))
 
     def _catch_up(self) -> None:
         if self._unadopted:

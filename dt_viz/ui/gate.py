@@ -313,7 +313,7 @@ class Gate:
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
             raise MalformedError from error
         if name == "FileTransferPart":
-            return connection.upload.part(message.transfer_uuid, message.part_index, len(message.content))
+            return self._continues(connection, message)
         if name == "FileTransferStartUpload":
             return self._begins(connection, message)
         return _is_finite(message)
@@ -331,6 +331,14 @@ class Gate:
             self._refused(client, str(error))
             return False
         return True
+
+    def _continues(self, connection: _Connection, message: Any) -> bool:  # noqa: ANN401 - FileTransferPart
+        """Return whether a part belongs to the file that is sent; whether that can be used, the page says itself."""
+        belongs = connection.upload.part(message.transfer_uuid, message.part_index, len(message.content))
+        client = None if self._server is None else patches.client_of(self._server, connection)
+        if belongs and client is not None and not connection.upload.uuid:
+            patches.hide_upload(client, message.transfer_uuid)
+        return belongs
 
 
 def _strict(name: str) -> type[msgspec.Struct]:

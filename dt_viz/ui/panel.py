@@ -48,6 +48,15 @@ MAX_UPLOAD = 50 * 10**6
 """Largest number of bytes of what a visitor sends."""
 NO_SCENE = "–"
 OFF = "Off"
+STYLE = """<style>
+[data-dock-tab] { padding: 0 0.45em !important; }
+@media (max-width: 36em) {
+    .mantine-Paper-root:has([role="status"]), .mantine-ScrollArea-content > div:has([role="status"]) {
+        width: 100% !important;
+    }
+}
+</style>"""
+"""Style of the panel: all tabs lie in one row, and on a phone it is as wide as the window."""
 SAVE_HINT = "Save: all that you have made, your own demonstrations too, as a file; “Open a file” goes on with it"
 SPACES: Mapping[str, Space] = {"Hand": "task", "Arm": "cspace"}
 """Spaces of the avoidance, by their names on the page."""
@@ -103,7 +112,7 @@ class ControlPanel:
         travels = {"Undo": Session.undo, "Redo": Session.redo, "Reset": reset, "Save": save}
         buttons = gui.add_button_group("History", tuple(travels), hint=SAVE_HINT)
         bindings.on(buttons, lambda session, button: travels[button](session))
-        gui.add_html("<style>[data-dock-tab] { padding: 0 0.45em !important }</style>")  # all tabs lie in one row
+        gui.add_html(STYLE)
         tabs = gui.add_tab_group()
         with tabs.add_tab("World"):
             loader = add_obstacles(gui, bindings)

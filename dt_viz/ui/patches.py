@@ -138,12 +138,15 @@ def drop_uploads(client: viser.ClientHandle) -> None:
 
 def refuse_upload(client: viser.ClientHandle, message: Any) -> None:  # noqa: ANN401 - FileTransferStartUpload
     """Have the page end an upload, which it shows until all of it is acknowledged. Hook: an upload that is refused."""
-    size = message.size_bytes
-    for told in (
-        viser._messages.FileTransferPartAck(message.source_component_uuid, message.transfer_uuid, size, size),
-        viser._messages.RemoveNotificationMessage(f"upload-{message.transfer_uuid}"),
-    ):
-        client._websock_connection.queue_message(told)
+    size, uuid = message.size_bytes, message.transfer_uuid
+    acknowledged = viser._messages.FileTransferPartAck(message.source_component_uuid, uuid, size, size)
+    client._websock_connection.queue_message(acknowledged)
+    hide_upload(client, uuid)
+
+
+def hide_upload(client: viser.ClientHandle, uuid: str) -> None:
+    """Have the page no longer show an upload, which it would call a success. Hook: a text of one's own for its end."""
+    client._websock_connection.queue_message(viser._messages.RemoveNotificationMessage(f"upload-{uuid}"))
 
 
 def put_back(handle: Any, value: Any, *, shown: bool) -> None:  # noqa: ANN401

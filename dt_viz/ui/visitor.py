@@ -38,8 +38,10 @@ from dt_viz.ui.keeping import Keeper
 from dt_viz.ui.panel import ControlPanel
 from dt_viz.ui.pen import Pen
 from dt_viz.ui.playback import Playback
-from dt_viz.ui.scene.camera import CameraController, Framing, Pose, view_of
+from dt_viz.ui.scene.camera import CameraController, Framing, Pose, shot_of, view_of
 from dt_viz.ui.scene.export import RESOLUTIONS, render_png
+from dt_viz.ui.scene.key import Key
+from dt_viz.ui.scene.legend import Legend
 from dt_viz.ui.scene.palette import DARK, LIGHT, Colour, Theme
 from dt_viz.ui.scene.recording import record
 from dt_viz.ui.scene.robot_scene import RobotScene
@@ -305,18 +307,24 @@ class Visitor(Display):
 
     def render(self, size: tuple[int, int], *, transparent: bool = False) -> bytes:
         """Render the scene as the visitor sees it, as a PNG of a width and height in pixels; see `render_png`."""
-        with self.pictures.without_handles(), self.robot.grip.hidden(), self._light():
-            return render_png(self.client, size, self._panel.legend, transparent=transparent)
+        with self._light(), self.pictures.without_handles(), self.robot.grip.hidden():
+            return render_png(self.client, size, self._camera.shot(size), self._legends, transparent=transparent)
 
     def render_alone(self, size: tuple[int, int], timeout: float) -> bytes:
         """Render the scene that is shown as `render` does, but framed in all of the picture; `timeout` in seconds."""
         assert self.shown is not None
         framing, panels = Framing(size, panel=0.0, narrow=0), [panel.shown for panel in self.shown.pictures.panels]
-        self._camera.choose(view_of(self.shown.task, framing, panels=panels))
+        shot = shot_of(view_of(self.shown.task, framing, panels=panels))
         self.robot.playback.advance(0.0)
         self.client.flush()
-        with self.pictures.without_handles(), self.robot.grip.hidden(), self._light():
-            return render_png(self.client, size, self._panel.legend, transparent=False, timeout=timeout)
+        with self._light(), self.pictures.without_handles(), self.robot.grip.hidden():
+            return render_png(self.client, size, shot, self._legends, transparent=False, timeout=timeout)
+
+    @property
+    def _legends(self) -> list[Legend | Key]:
+        """What explains the colours of a picture."""
+        legend = self._panel.legend
+        return [*([] if legend is None else [legend]), *self.pictures.keys]
 
     def _record(self, step: Step) -> bytes:
         """Make a page that replays what is shown; raises FormatError where that is nothing yet."""

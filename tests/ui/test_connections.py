@@ -536,9 +536,14 @@ def uploads_of(visitor):
 @asynchronous
 async def test_what_is_wrong_with_a_file_is_said_and_none_of_it_is_held(url, server, content, announced, said):
     async with visiting(url) as client:
+        kinds, apply = [], client._apply
+        client._apply = lambda message, now: (kinds.append(message["type"]), apply(message, now))[1]
         await client.send_file(UPLOAD, "x.stl", content, announced=announced)
         assert await client.wait_for(lambda: client.notices, PATIENCE)
         assert client.notices[0].startswith(said) and len(client.notices) == 1
+        # the page's own notice of an upload is hidden before it says that it was successful
+        upload = [kind for kind in kinds if kind in {"FileTransferPartAck", "RemoveNotificationMessage"}]
+        assert sorted(upload[-2:]) == ["FileTransferPartAck", "RemoveNotificationMessage"]
         assert await answers(client)
         assert not uploads_of(server.visitors[0])
 

@@ -1,5 +1,6 @@
 """The camera: what is to be seen of a task fills the part of the window that the panel leaves."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,7 +10,19 @@ from hypothesis import strategies as st
 from pages import camera_for
 
 from dt_viz.scenario.tasks import TASKS
-from dt_viz.ui.scene.camera import HAND, HOME, VIEWS, Framing, axes, framed, places_of, turned, window_size
+from dt_viz.ui.scene.camera import (
+    HAND,
+    HOME,
+    VIEWS,
+    Framing,
+    axes,
+    framed,
+    places_of,
+    shot_beside,
+    shot_of,
+    turned,
+    window_size,
+)
 
 
 def screen(size):
@@ -105,3 +118,20 @@ def test_no_camera_nearer_by_sees_all_points(seed):
 @pytest.mark.parametrize("size", [(0, 0), (10, 720), (np.nan, 720), ("wide", 720), (10**9, 720), (None, None)])
 def test_a_size_that_no_window_has_is_not_believed(size):
     assert window_size(screen(size)) == Framing.size
+
+
+@pytest.mark.parametrize("window", [(1280, 720), (1920, 1080), (390, 844)], ids=str)
+@pytest.mark.parametrize("size", [(1920, 1080), (1280, 1280), (600, 1200)], ids=str)
+def test_a_saved_picture_has_in_its_middle_what_is_seen_beside_the_panel(window, size):
+    """Points of the plane at which the camera looks: the free part's corners touch two of the picture's borders."""
+    framing, pose = replace(Framing(window), margin=0.0), camera_for(TASKS["lift_box"](), screen(window))
+    straight = shot_of(pose)
+    taken = shot_beside(pose, straight.wxyz, Framing(window), size)
+    ahead, right, up = axes(pose[1] - pose[0])
+    depth = np.linalg.norm(pose[1] - pose[0])
+    across, upright = framing.free
+    corners = [pose[0] + depth * (ahead + x * right + y * up) for x in across for y in upright]
+    offsets = (np.array(corners) - taken.position) @ np.stack([right, up], axis=1) / depth / np.tan(taken.fov / 2)
+    offsets[:, 0] *= size[1] / size[0]  # from -1 to 1 in the picture
+    assert offsets.mean(axis=0) == pytest.approx([0, 0], abs=1e-9)
+    assert np.abs(offsets).max() == pytest.approx(1, abs=1e-9)

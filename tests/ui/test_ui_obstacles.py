@@ -24,6 +24,7 @@ from dt_viz.ui.scene.draggables import Obstacles, shaded
 from dt_viz.ui.scene.markers import in_slice
 from dt_viz.ui.scene.picture import Look
 from dt_viz.ui.scene.slice_layers import OccupancySlice
+from dt_viz.ui.tabs.from_file import PLACED
 from dt_viz.ui.tabs.world import SHAPES, add, add_obstacles, delete, duplicate, name_of, with_room
 from dt_viz.warning import Severity
 
@@ -226,6 +227,7 @@ def test_a_file_that_is_uploaded_becomes_an_obstacle(opened):
         *_, added = opened.session.scenario.obstacles
         assert isinstance(added, shape) and added.radius == pytest.approx(0.04, abs=0.01)
         assert f"{opened.session.scenario.selected + 1}: {name_of(added)}" == label
+        assert opened.said[-1] == (f"{name}: {PLACED}", Severity.NOTE)
 
 
 def stl(mesh):
@@ -268,7 +270,7 @@ def test_a_file_in_another_unit_is_read_in_that_once_it_is_asked_for(opened):
         _, added = opened.session.scenario.obstacles
         assert added.size == pytest.approx(0.08, abs=1e-3)
         assert not opened.files.again.visible and opened.files.unit.value == "millimetres"
-    assert opened.said == [(question, Severity.WARNING)]
+    assert opened.said == [(question, Severity.WARNING), (f"ball.stl: {PLACED}", Severity.NOTE)]
 
 
 def test_a_file_whose_visitor_has_left_becomes_no_obstacle(opened):

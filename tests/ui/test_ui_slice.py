@@ -20,7 +20,8 @@ from dt_viz.session.frame import Stage
 from dt_viz.ui.scene.colour_scale import NUM_SHADES, from_oklab, oklab, ramp
 from dt_viz.ui.scene.draggables import MovableSlice, Obstacles
 from dt_viz.ui.scene.export import as_png
-from dt_viz.ui.scene.legend import OCCUPANCY, legend_of
+from dt_viz.ui.scene.key import Key
+from dt_viz.ui.scene.legend import OCCUPANCY, drawn_onto, legend_of
 from dt_viz.ui.scene.palette import LIGHT, css
 from dt_viz.ui.scene.picture import Look
 from dt_viz.ui.scene.rollouts import Rollouts
@@ -222,7 +223,7 @@ LEGENDS = {
 @pytest.mark.parametrize(("what", "height"), [("det", 540), ("lyapunov", 720), ("occupancy", 1080)])
 def test_a_saved_picture_has_the_legend_in_its_corner_and_nothing_else_is_changed(what, height):
     legend, blank = LEGENDS[what], Image.new("RGBA", (height * 16 // 9, height))
-    pixels = np.asarray(legend.drawn_onto(blank))
+    pixels = np.asarray(drawn_onto(blank, [legend]))
     rows, columns = np.nonzero(pixels[..., 3])
     assert rows.min() > 0.8 * height and columns.max() < 0.65 * height
     assert np.asarray(blank)[..., 3].max() == 0
@@ -236,12 +237,20 @@ def test_a_saved_picture_has_the_legend_in_its_corner_and_nothing_else_is_change
 
 def test_a_saved_picture_is_white_behind_or_transparent():
     blank = Image.new("RGBA", (320, 180))
-    for legend in (None, OCCUPANCY):
-        white = Image.open(io.BytesIO(as_png(blank, legend, transparent=False)))
-        clear = Image.open(io.BytesIO(as_png(blank, legend, transparent=True)))
+    for legends in ([], [OCCUPANCY]):
+        white = Image.open(io.BytesIO(as_png(blank, legends, transparent=False)))
+        clear = Image.open(io.BytesIO(as_png(blank, legends, transparent=True)))
         assert (white.mode, clear.mode) == ("RGB", "RGBA")
         assert white.getpixel((300, 10)) == (255, 255, 255) and clear.getpixel((300, 10)) == (0, 0, 0, 0)
-        assert (np.asarray(white).min() < 255) == (legend is not None)
+        assert (np.asarray(white).min() < 255) == bool(legends)
+
+
+def test_the_key_of_methods_stands_above_the_legend_of_colours():
+    key, blank = Key((("Ours", (200, 80, 0)), ("EFlow", (0, 90, 200)))), Image.new("RGBA", (1280, 720))
+    both, alone = (np.asarray(drawn_onto(blank, legends)) for legends in ([OCCUPANCY, key], [OCCUPANCY]))
+    rows = [np.nonzero((both[..., :3] == colour).all(axis=-1))[0].mean() for _, colour in key.lines]
+    top = np.nonzero(alone[..., 3])[0].min()
+    assert rows[0] < rows[1] < top and (both[top:] == alone[top:]).all()
 
 
 # --- The panel ---

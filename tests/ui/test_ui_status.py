@@ -36,6 +36,7 @@ from dt_viz.ui.tabs.status import (
     LEADING,
     PALE,
     REASON,
+    UNDO,
     WARP_HINT,
     Verdict,
     concerns,
@@ -134,7 +135,9 @@ def test_the_gravest_reason_comes_first_whatever_order_they_are_found_in():
     for found in (by_concern, by_concern[::-1]):
         told = frame(certificates=HOLDING.warning(*found))
         assert [*concerns(told, View())] == by_concern
-        assert verdict_of(told).reason == "it enters (and 3 more: see Details)"
+        assert verdict_of(told).reason == "it enters; it is odd (and 2 more: see Details)"
+    pair = frame(certificates=HOLDING.warning(*by_concern[:2]))
+    assert verdict_of(pair).reason == "it enters; it is odd"
     for concern, warning in zip(Concern, by_concern, strict=True):
         said = verdict_of(frame(certificates=HOLDING.warning(warning)))
         assert said.line[2:].startswith(concern.value) and said.severity is concern.severity
@@ -292,14 +295,19 @@ ENTERS = Certificates(0.01).warning(MotionWarning(Kind.ARM_ENTERS, "finger tip 1
 
 def test_the_whole_arm_is_let_avoid_where_that_mends():
     told = frame(certificates=ENTERS)
-    found = remedy(told, HAND)
+    found = remedy(told, Progress(HAND))
     assert found is not None and found.label == "Let the whole arm avoid"
-    assert replace(HAND, **found.changes) == WHOLE
+    assert replace(HAND, **found.changes or {}) == WHOLE
     for scenario in (WHOLE, replace(HAND, view=View(arm=False))):
-        assert remedy(replace(told, scenario=scenario), scenario) is None
-    assert remedy(told, changed(HAND, temperature=3.0)) is None  # it is of another motion
-    for other in (frame(), replace(told, blocked=(ODD,)), frame(certificates=Certificates(0.01).warning(ODD))):
-        assert remedy(other, HAND) is None
+        assert remedy(replace(told, scenario=scenario), Progress(scenario)) is None
+    assert remedy(told, Progress(changed(HAND, temperature=3.0))) is None  # it is of another motion
+
+
+def test_what_nothing_else_mends_is_mended_by_undo_where_there_is_a_step():
+    for told in (frame(blocked=(ODD,)), frame(certificates=Certificates(0.01).warning(ODD))):
+        assert remedy(told, Progress(HAND)) is None
+        assert remedy(told, Progress(HAND, steps=(True, False))) is UNDO
+    assert remedy(frame(), Progress(HAND, steps=(True, True))) is None
 
 
 IN_STROKE = Sphere(TASKS["draw_s"]().obstacle_position, 0.12)
@@ -319,8 +327,8 @@ def test_a_remedy_mends_what_it_is_offered_for(name, engine: Engine):
     scenario = avoiding("draw_s", IN_STROKE, view=View(arm=False, field=False), **SPOILED[name])
     *_, told = engine.frames(scenario)
     assert verdict_of(told).severity is not Severity.GOOD
-    found = remedy(told, scenario)
-    assert found is not None
+    found = remedy(told, Progress(scenario))
+    assert found is not None and found.changes is not None
     *_, told = engine.frames(replace(scenario, **found.changes))
     assert verdict_of(told).severity is Severity.GOOD, verdict_of(told)
 

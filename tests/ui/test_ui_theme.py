@@ -8,6 +8,7 @@ import pytest
 from dt_viz.session.frame import Stage
 from dt_viz.session.progress import Pace
 from dt_viz.ui.scene.palette import DARK, Theme
+from dt_viz.ui.scene.stage import background
 from dt_viz.ui.scene.style import STYLES, Style
 
 LINES = ("demonstration", "rollout", "added", "ghost", "way", "goal", "obstacle", "bias", "streamline", "arrow_fast")
@@ -70,15 +71,18 @@ def test_the_light_theme_comes_back_as_it_was(page, monkeypatch):
 
 
 def test_a_picture_is_saved_in_light_colours_and_the_dark_theme_stays(page, monkeypatch):
-    light, taken = colours(page), []
+    light, taken, grounds = colours(page), [], []
     choose(page, True)
     dark = colours(page)
 
+    monkeypatch.setattr(page.scene, "set_background_image", lambda image, *_: grounds.append(image))
+
     def render(*_size, **_how):
-        taken.append(colours(page))
+        taken.append((colours(page), grounds[-1]))
         return np.zeros((2, 2, 4), np.uint8)
 
     monkeypatch.setattr(page.client, "get_render", render)
     page.visitor.render((1280, 720))
-    assert taken[0] == light and colours(page) == dark != light
+    assert taken == [(light, None)] and colours(page) == dark != light
+    assert np.array_equal(grounds[-1], background(DARK))
     choose(page, False)

@@ -7,10 +7,11 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import viser
+from viser.transforms import SO3
 
 from dt_viz.flows.fields import Array
 from dt_viz.scenario.panels import TITLE_ROOM, directions
@@ -33,6 +34,17 @@ PAUSE = 1.5
 
 Pose = tuple[Array, Array]
 """Position (3,) and look-at (3,) of a camera, metres."""
+
+
+class Shot(NamedTuple):
+    """The camera of a picture."""
+
+    wxyz: Array
+    """(4,) quaternion: x to the right, y down, z ahead."""
+    position: Array
+    """(3,), metres."""
+    fov: float
+    """Vertical field of view, rad."""
 
 
 @dataclass(frozen=True)
@@ -155,6 +167,34 @@ def axes(direction: Array) -> tuple[Array, Array, Array]:
     return ahead, right, np.cross(right, ahead)
 
 
+def shot_of(pose: Pose) -> Shot:
+    """Return the camera of a picture that stands where a pose is, and fills the picture as a view fills the window."""
+    ahead, right, up = axes(pose[1] - pose[0])
+    turn = SO3.from_matrix(np.stack([right, -up, ahead], axis=1))
+    return Shot(turn.wxyz, pose[0], Framing.field_of_view)
+
+
+def shot_beside(pose: Pose, wxyz: Array, framing: Framing, size: tuple[int, int]) -> Shot:
+    """Return the camera of a picture that has what the free part of the window shows in its middle, as large as can be.
+
+    It looks the same way, from beside the window's camera: at the depth of what that looks at nothing is cut off.
+
+    Args:
+        pose: of the window's camera.
+        wxyz: (4,) quaternion of the window's camera.
+        framing: the window; its margin is part of what is shown.
+        size: width and height of the picture, pixels.
+    """
+    position, look_at = pose
+    across, upright = replace(framing, margin=0.0).free
+    right, down, _ = SO3(wxyz).as_matrix().T
+    depth = np.linalg.norm(look_at - position)
+    width, height = size
+    half = max(np.ptp(upright), np.ptp(across) * height / width) / 2
+    beside = depth * (across.mean() * right - upright.mean() * down)
+    return Shot(wxyz, position + beside, float(2 * np.arctan(half)))
+
+
 def framed(points: Array, direction: Array, across: Array, upright: Array) -> Pose:
     """Return the nearest camera that sees all points within a part of its picture.
 
@@ -243,6 +283,12 @@ class CameraController:
     def framing(self) -> Framing:
         """The framing in the window as it is now."""
         return replace(self._framing, size=window_size(self._client.camera, self._width))
+
+    def shot(self, size: tuple[int, int]) -> Shot:
+        """Return the camera of a picture, of a width and height in pixels, of what is seen beside the panel."""
+        camera = self._client.camera
+        position, look_at = (np.asarray(at, dtype=float) for at in (camera.position, camera.look_at))
+        return shot_beside((position, look_at), np.asarray(camera.wxyz, dtype=float), self.framing, size)
 
     def look(self, task: Task, panels: Sequence[Slice] = ()) -> None:
         """Move the camera to where the task, or the panels beside its scene, are seen best."""

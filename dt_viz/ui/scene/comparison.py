@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from itertools import cycle
 
 import numpy as np
@@ -11,10 +12,11 @@ import viser
 from dt_viz.flows.fields import Array
 from dt_viz.metrics import distance_from_path
 from dt_viz.robot.robot import Robot
-from dt_viz.session.comparison import OTHERS
+from dt_viz.session.comparison import OTHERS, OURS
 from dt_viz.session.frame import Compared, Frame, Stage
 from dt_viz.ui.playback import Replay
 from dt_viz.ui.scene.arm import GhostArm
+from dt_viz.ui.scene.key import Key
 from dt_viz.ui.scene.palette import LIGHT, Colour, Theme
 from dt_viz.ui.scene.picture import Lines, Look, Picture, add_label
 from dt_viz.ui.scene.style import STYLES
@@ -66,6 +68,24 @@ class ComparedMotions(Picture):
         self._scene = scene
         self.motions: dict[str, _DrawnMotions] = {}
         """Of the methods that were ever shown."""
+
+    @property
+    def key(self) -> Key | None:
+        shown = [method for method in OTHERS if method.name in self.motions and self.motions[method.name].node.visible]
+        if not (shown and self.visible):
+            return None
+        return Key(((OURS.title, LIGHT.rollout), *((method.title, COLOURS[method.name]) for method in shown)))
+
+    @contextmanager
+    def without_handles(self) -> Iterator[None]:
+        """Hide the names beside the motions: a picture has the key instead."""
+        for motions in self.motions.values():
+            motions.label.visible = False
+        try:
+            yield
+        finally:
+            for motions in self.motions.values():
+                motions.label.visible = True
 
     def draw(self, frame: Frame, look: Look) -> None:
         shown = {compared.method.name: compared for compared in frame.comparison if compared.method.name in COLOURS}

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import html
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 
 from dt_viz.pictures.slice_fields import ColourPicture
 from dt_viz.ui.scene.colour_scale import NUM_SHADES, Scale
+from dt_viz.ui.scene.key import INK, Key, plate
 from dt_viz.ui.scene.palette import LIGHT, Colour, css
 from dt_viz.ui.scene.slice_layers import DET_DECADES, OCCUPANCY_SCALE, scale_of
 
@@ -47,29 +49,34 @@ class Legend:
             f"<div style='position:relative;height:1.5em'>{numbers}</div>{mark}{html.escape(self.note)}</div>"
         )
 
-    def drawn_onto(self, image: Image.Image) -> Image.Image:
-        """Draw the legend onto a copy of the RGBA image, in its lower left corner, scaled to its height."""
-        em, ink = round(0.022 * image.height), (52, 58, 68)
+    def drawn(self, em: int) -> Image.Image:
+        """Draw the legend as an RGBA image in type of a size in pixels."""
         line, left, width = round(1.45 * em), round(1.6 * em), 24 * em
-        font = ImageFont.load_default(em)
-        plate = Image.new("RGBA", (width + 2 * left, (4 + bool(self.note)) * line))
-        draw = ImageDraw.Draw(plate)
-        draw.rounded_rectangle((0, 0, plate.width - 1, plate.height - 1), radius=em // 2, fill=(255, 255, 255, 225))
-        draw.text((left, line), self.title, ink, font, anchor="lm")
+        card, draw, font = plate(width + 2 * left, (4 + bool(self.note)) * line, em)
+        draw.text((left, line), self.title, INK, font, anchor="lm")
         shades = Image.fromarray(self.scale.shades[None]).resize((width, round(0.8 * em)), Image.Resampling.BILINEAR)
-        plate.paste(shades, (left, round(1.55 * line)))
+        card.paste(shades, (left, round(1.55 * line)))
         for value, text in self.ticks:
-            draw.text((left + self.scale.relative(value) * width, round(2.9 * line)), text, ink, font, anchor="mm")
+            draw.text((left + self.scale.relative(value) * width, round(2.9 * line)), text, INK, font, anchor="mm")
         if self.note:
             start = left
             if self.swatch:
                 low = 3.95 * line
                 draw.rectangle((left, low - 0.35 * em, left + 1.2 * em, low + 0.35 * em), fill=self.swatch)
                 start += round(1.7 * em)
-            draw.text((start, round(3.95 * line)), self.note, ink, font, anchor="lm")
-        whole = image.copy()
-        whole.alpha_composite(plate, (em, image.height - em - plate.height))
-        return whole
+            draw.text((start, round(3.95 * line)), self.note, INK, font, anchor="lm")
+        return card
+
+
+def drawn_onto(image: Image.Image, legends: Iterable[Legend | Key]) -> Image.Image:
+    """Draw legends onto a copy of an RGBA image, one above the other in its lower left corner, scaled to its height."""
+    whole, em = image.copy(), round(0.022 * image.height)
+    bottom = image.height - em
+    for legend in legends:
+        card = legend.drawn(em)
+        whole.alpha_composite(card, (em, bottom - card.height))
+        bottom -= card.height + em // 2
+    return whole
 
 
 OCCUPANCY = Legend(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from dt_viz.flows.fields import Array
 from dt_viz.session.engine import ArmMotion
 from dt_viz.session.frame import Frame
+from dt_viz.ui.scene.key import Key
 from dt_viz.ui.scene.palette import LIGHT, Theme, linear
 from dt_viz.ui.scene.style import Style
 from dt_viz.ui.scene.tubes import RolloutTubes
@@ -88,6 +90,16 @@ class Picture(Shown, ABC):
 
     _sources: tuple[object, ...] = ()
     """What it was drawn from last."""
+
+    @property
+    def key(self) -> Key | None:
+        """What names its lines in a saved picture; None where nothing is to be named."""
+        return None
+
+    @contextmanager
+    def without_handles(self) -> Iterator[None]:
+        """Hide what is there for the page only, for as long as a picture takes."""
+        yield
 
     @abstractmethod
     def draw(self, frame: Frame, look: Look) -> None:

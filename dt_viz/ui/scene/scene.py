@@ -21,6 +21,7 @@ from dt_viz.ui.scene.arm import ArmSequence
 from dt_viz.ui.scene.board import Board
 from dt_viz.ui.scene.comparison import ComparedMotions
 from dt_viz.ui.scene.draggables import BiasPoints, MovableSlice, Obstacles, Starts
+from dt_viz.ui.scene.key import Key
 from dt_viz.ui.scene.palette import LIGHT, Theme
 from dt_viz.ui.scene.panels import Panels
 from dt_viz.ui.scene.picture import Look, Picture, add_ball, add_label
@@ -114,6 +115,11 @@ class ScenePictures:
         return self._by_view[view]
 
     @property
+    def keys(self) -> list[Key]:
+        """What names lines in a saved picture."""
+        return [key for picture in self._by_view.values() if (key := picture.key) is not None]
+
+    @property
     def stale(self) -> bool:
         """Whether the last frame belongs to another task or scene than the scenario adopted since."""
         return not (self._frame is None or self._adopted is None or self._frame.scenario.begins_like(self._adopted))
@@ -196,13 +202,8 @@ class ScenePictures:
 
     @contextmanager
     def without_handles(self) -> Iterator[None]:
-        """Hide all handles for as long as a picture takes, and the table: on white it would end at the horizon."""
-        table = self._by_view["table"]
-        shown, table.visible = table.visible, False
-        try:
-            with ExitStack() as stack:
-                for markers in self.markers:
-                    stack.enter_context(markers.without_handles())
-                yield
-        finally:
-            table.visible = shown
+        """Hide what is there for the page only, for as long as a picture takes."""
+        with ExitStack() as stack:
+            for picture in (*self._always, *self._by_view.values()):
+                stack.enter_context(picture.without_handles())
+            yield

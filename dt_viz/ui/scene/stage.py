@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import numpy as np
 import viser
 from numpy.typing import NDArray
@@ -52,6 +55,18 @@ class Stage(Picture):
         if look.theme.table != self.node.color:
             self._paint(look.theme)
 
+    @contextmanager
+    def without_handles(self) -> Iterator[None]:
+        """Hide the background, and the table, which would end at the horizon of a white picture."""
+        shown, self.visible = self.visible, False
+        self._scene.set_background_image(None)
+        try:
+            yield
+        finally:
+            self.visible = shown
+            self._scene.set_background_image(background(self._theme), "png")
+
     def _paint(self, theme: Theme) -> None:
+        self._theme = theme
         self._scene.set_background_image(background(theme), "png")
         self.node.color = theme.table

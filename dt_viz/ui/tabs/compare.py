@@ -24,11 +24,6 @@ from dt_viz.ui.scene.palette import css
 from dt_viz.ui.tabs.plots import add_plot, columns, curve, small
 
 NONE = "–"
-SHORT = {
-    "ours-no-avoidance": "No avoidance",
-    "eflow-repulsive": "EFlow, field",
-}
-"""Names of methods that fit beside a box, where the title does not."""
 DEEP = 0.001
 """Maximum collision distance from which on it is marked, metres."""
 COLUMNS = (
@@ -38,6 +33,7 @@ COLUMNS = (
     ("off goal", "largest distance of a motion’s end from the goal"),
 )
 """Heads of the table, each with what it means; all are in millimetres."""
+NOTE = "Lower is better. All motions are scored; the plots below follow the one that the arm follows."
 TITLES = ("Distance to the demonstration [mm]", "Depth of the hand in the obstacle [mm]")
 
 
@@ -45,12 +41,11 @@ class ComparePanel:
     """Controls of the comparison, its table, and figure 6 of the paper for one motion."""
 
     def __init__(self, gui: viser.GuiApi, bindings: Bindings) -> None:
-        self._drawn: tuple[str, ...] = ()
-        """Names of the methods in the plots."""
+        self._drawn: tuple[Method, ...] = ()
+        """Methods in the plots."""
         with gui.add_folder("Methods"):  # closed by a click, so that the table is seen at once on a small screen
             for method in OTHERS:
-                label = SHORT.get(method.name, method.title)
-                box = gui.add_checkbox(label, False, disabled=bool(method.missing), hint=hint(method))
+                box = gui.add_checkbox(method.title, False, disabled=bool(method.missing), hint=hint(method))
                 bindings.input(box, lambda s, name=method.name: name in s.view.compared, partial(_compare, method.name))
         self.table = gui.add_html("", visible=False)
         titles = {method.title: method.name for method in OTHERS if not method.missing}
@@ -73,14 +68,14 @@ class ComparePanel:
             return
         self.table.content = table_html(comparison)
         plotted = [compared for compared in comparison if compared.curves is not None]
-        names = tuple(compared.method.name for compared in plotted)
+        methods = tuple(compared.method for compared in plotted)
         curves = [1e3 * compared.curves for compared in plotted if compared.curves is not None]
         along = np.linspace(0, 1, NUM_SAMPLES)
         for k, plot in enumerate(self.plots):
-            if names != self._drawn:
-                plot.series = (uplot.Series(label="path"), *_curves(names))
+            if methods != self._drawn:
+                plot.series = (uplot.Series(label="path"), *_curves(methods))
             plot.data = columns(along, *(curve[:, k] for curve in curves)) if curves else (np.zeros(2),) * 2
-        self._drawn = names
+        self._drawn = methods
 
 
 def hint(method: Method) -> str:
@@ -96,11 +91,11 @@ def hint(method: Method) -> str:
 def table_html(comparison: Sequence[Compared]) -> str:
     """Return a table of how the methods fare, each with its promise or what keeps it from moving."""
     pale = f"{_CELL};opacity:0.65"
-    heads = "".join(f"<th title='{escape(why)}' style='{pale}'>{name}</th>" for name, why in COLUMNS)
+    heads = "".join(f"<th title='{escape(why)}' style='{pale};white-space:normal'>{name}</th>" for name, why in COLUMNS)
     head = f"<tr><th style='{pale};text-align:left'>mm</th>{heads}</tr>"
     rows = "".join(_row(compared) for compared in comparison)
     table = f"<table style='border-collapse:collapse;width:100%'>{head}{rows}</table>"
-    return small(table, tight=True)
+    return small(f"{table}<div style='opacity:0.65;padding-top:0.5em'>{NOTE}</div>", tight=True)
 
 
 _CELL = "font-weight:600;text-align:right;padding:0 0 0 0.4em;white-space:nowrap"
@@ -132,8 +127,8 @@ def _colour(name: str) -> tuple[int, int, int]:
     return COLOURS.get(name, palette.LIGHT.rollout)
 
 
-def _curves(names: Sequence[str]) -> tuple[uplot.Series, ...]:
-    return tuple(curve(name, _colour(name)) for name in (names or (OURS.name,)))
+def _curves(methods: Sequence[Method]) -> tuple[uplot.Series, ...]:
+    return tuple(curve(method.title, _colour(method.name)) for method in (methods or (OURS,)))
 
 
 def _compare(name: str, scenario: Scenario, shown: bool) -> dict[str, Any]:

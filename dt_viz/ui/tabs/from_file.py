@@ -31,6 +31,7 @@ from dt_viz.warning import Severity
 ORIGIN: Point = (0.0, 0.0, 0.0)
 """Place of an obstacle that is not put anywhere yet."""
 FORMATS = ", ".join(dict.fromkeys(suffix[1:] for suffix in (*MESH_SUFFIXES, *CLOUD_SUFFIXES)))
+PLACED = "put where there is room beside the motion, not where the file has it: drag it to its place"
 LANE = "file"
 """Lane of the session's jobs on which one file is read."""
 
@@ -114,8 +115,8 @@ class FileLoader:
             with turn(session.say, left):
                 obstacle, notes = from_file(content, name, scale, left)
             self._add(session, obstacle)
-            if notes:
-                session.say(f"{name}: {'; '.join(notes)}", Severity.WARNING)
+            severity = Severity.WARNING if notes else Severity.NOTE
+            session.say(f"{name}: {'; '.join((*notes, PLACED))}", severity)
         except SizeError as error:
             if error.unit is not None:
                 self._refused = content, name, error.unit

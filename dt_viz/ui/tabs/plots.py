@@ -184,11 +184,11 @@ class HealthPlots(Shown):
 
 
 def table_html(profiles: Profiles) -> str:
-    """Return a table of the Fréchet distance and M.C.D. of both motions."""
+    """Return a table of the Fréchet distance and the maximum collision distance of both motions."""
     shown, without = profiles.shown, profiles.undisturbed
     bounded = bool(np.isfinite(shown.clearance).all())
     depths = (shown.depth, without.depth) if bounded else (None, None)
-    rows = (("Fréchet distance", shown.frechet, without.frechet), ("M.C.D.", *depths))
+    rows = (("Fréchet distance", shown.frechet, without.frechet), ("Depth in obstacle", *depths))
     cells = "".join(
         f"<tr><td style='opacity:0.65;padding-right:0.9em'>{name}</td>"
         + "".join(f"<td style='font-weight:600;padding-right:0.9em'>{_length(value)}</td>" for value in values)
@@ -196,7 +196,8 @@ def table_html(profiles: Profiles) -> str:
         for name, *values in rows
     )
     head = "".join(f"<td style='opacity:0.65;padding-right:0.9em'>{name}</td>" for name in ("", "with", "without"))
-    return small(f"<table><tr>{head}</tr>{cells}</table>")
+    note = "<div style='opacity:0.65'>Of the motion that the arm follows; Details and Compare take all motions.</div>"
+    return small(f"<table><tr>{head}</tr>{cells}</table>{note}")
 
 
 def _length(metres: float | None) -> str:

@@ -43,6 +43,8 @@ LEADING = 1.35 * 0.8
 """Height of a line of small text, em."""
 HINT, REASON, BUTTON = 3.3, 4.5, 2.25
 """Heights of the places of the hint and of the reason, and of a button in the latter, em."""
+DETAILS = 11
+"""Largest height of the details, em: on a laptop the tabs below them stay in sight."""
 ROWS: Mapping[str, str] = {
     "Rebuild": "Time from the last change until its motion was shown. Changes that a newer one overtook are skipped.",
     "Clearance": "Smallest distance from the obstacles of what gives way to them: the end effector, or the body points "
@@ -117,11 +119,10 @@ def _judged(frame: Frame, found: tuple[MotionWarning, ...]) -> tuple[str, Severi
         return f"warp {frame.scenario.warp:.2f}", Severity.NOTE, WARP_HINT.format(frame.scenario.warp)
     if not found:
         return "✓ safe", Severity.GOOD, HOLDS
-    gravest, *others = found
-    concern = gravest.kind.concern
-    more = f" (and {len(others)} more: see Details)" if others else ""
+    concern = found[0].kind.concern
+    more = f" (and {len(found) - 2} more: see Details)" if len(found) > 2 else ""
     mark = "✕" if concern.severity is Severity.ALARM else "⚠"
-    return f"{mark} {concern.value}", concern.severity, f"{gravest}{more}"
+    return f"{mark} {concern.value}", concern.severity, f"{'; '.join(map(str, found[:2]))}{more}"
 
 
 def concerns(frame: Frame, view: View) -> tuple[MotionWarning, ...]:
@@ -163,18 +164,23 @@ class Remedy:
 
     label: str
     """Label of its button."""
-    changes: Mapping[str, Any]
-    """Fields of the scenario that it replaces."""
+    changes: Mapping[str, Any] | None
+    """Fields of the scenario that it replaces; None where it takes the last step back."""
 
 
-def remedy(frame: Frame, wanted: Scenario) -> Remedy | None:
+UNDO = Remedy("Undo the last change", None)
+
+
+def remedy(frame: Frame, progress: Progress) -> Remedy | None:
     """Return what mends the gravest problem of the newest frame; None if nothing does, or other motions are wanted."""
-    if frame.blocked or frame.scenario.choices != wanted.choices:
+    wanted = progress.wanted
+    if frame.scenario.choices != wanted.choices:
         return None
-    if wanted.warp < 1:
+    if wanted.warp < 1 and not frame.blocked:
         return Remedy("Complete the warp", {"warp": 1.0})
     found = concerns(frame, wanted.view)
-    return _against(found[0].kind.mend, found[0].source, wanted) if found else None
+    mends = None if frame.blocked or not found else _against(found[0].kind.mend, found[0].source, wanted)
+    return UNDO if mends is None and progress.steps[0] and (frame.blocked or found) else mends
 
 
 def _against(mend: Mend | None, source: str, scenario: Scenario) -> Remedy | None:
@@ -231,6 +237,13 @@ def hint_html(text: str) -> str:
     return place_html(text, (40, 44, 52), HINT)
 
 
+def steps_html(steps: tuple[bool, bool]) -> str:
+    """Return what dims the first two of the buttons after it, Undo and Redo, where there is no such step."""
+    idle = (f"div:has(> .dt-steps) + div button:nth-of-type({k})" for k, step in enumerate(steps, start=1) if not step)
+    style = "".join(f"{button} {{ opacity: 0.35; pointer-events: none; }}" for button in idle)
+    return f"<style>{style}</style><div class='dt-steps'></div>"
+
+
 def progress_html(fraction: float) -> str:
     """Return a bar of progress, from 0 to 1."""
     full, pale = COLOURS[Severity.NOTE]
@@ -271,7 +284,7 @@ def _rows(frame: Frame, pace: Pace, view: View) -> Iterator[tuple[str, str]]:
     whole_arm = frame.scenario.arm_avoidance is not None
     rate = f" · {pace.rate:.0f} frames/s" if pace.rate > 1 else ""
     yield "Rebuild", f"{1e3 * pace.latency:.0f} ms{rate} · {pace.num_skipped} skipped"
-    clearance = f"{1e3 * known.clearance:.1f} mm, {'body points' if whole_arm else 'end effector'}"
+    clearance = f"{1e3 * known.clearance:.1f} mm, {'body points' if whole_arm else 'end effector'}, all motions"
     yield "Clearance", off if frame.blocked else "no obstacle" if known.clearance == float("inf") else clearance
     if shows_arm(view):
         yield from collision_rows(known.collision, unknown)
@@ -334,16 +347,20 @@ def sentence(text: str) -> str:
 
 
 class StatusLine:
-    """The controls of the status. They keep their height whatever comes: a button takes its room from the reason's."""
+    """The controls of the status, and the style of the buttons after them, see `steps_html`.
+
+    They keep their height whatever comes: a button takes its room from the reason's.
+    """
 
     def __init__(self, gui: viser.GuiApi, bindings: Bindings) -> None:
         """Build the controls where the panel is being built; the buttons act on the session of the bindings."""
-        self._shown: Frame | None = None
+        self._told: Progress | None = None
         self.line = gui.add_html("")
         self.mend = gui.add_button("Mend", icon=viser.Icon.SHIELD_CHECK, visible=False)
         self.cancel = gui.add_button("Cancel", icon=viser.Icon.X, visible=False)
         with gui.add_folder("Details", expand_by_default=False):
             self.details = gui.add_html("")
+        self.steps = gui.add_html(steps_html((False, False)))
         bindings.on(self.cancel, lambda session, _pressed: session.cancel())
         bindings.on(self.mend, lambda session, _pressed: self._mend(session))
 
@@ -356,10 +373,11 @@ class StatusLine:
         if progress.learning is not None:
             (fraction, text), severity = progress.learning, Severity.NOTE
             below = progress_html(fraction)
-        self._shown = frame = progress.shown
+        self._told, frame = progress, progress.shown
+        self.steps.content = steps_html(progress.steps)
         mends = None
         if frame is not None and progress.message is None and not progress.stale:
-            mends = remedy(frame, progress.wanted)
+            mends = remedy(frame, progress)
         if mends is not None:
             self.mend.label = mends.label
         self.mend.visible, self.cancel.visible = mends is not None, progress.learning is not None
@@ -367,9 +385,15 @@ class StatusLine:
         self.line.content = line_html(known) + place_html(text, COLOURS[severity][0], room, below)
         if frame is not None:
             details = details_html(frame, progress.pace, progress.wanted.view)
+            details = f"<div style='max-height:{DETAILS}em;overflow-y:auto'>{details}</div>"
             self.details.content = f"<div style='{PALE}'>{details}</div>" if progress.stale else details
 
     def _mend(self, session: Session) -> None:
-        found = None if self._shown is None else remedy(self._shown, session.scenario)
-        if found is not None:
+        told = self._told
+        if told is None or told.shown is None:
+            return
+        found = remedy(told.shown, replace(told, wanted=session.scenario))
+        if found is UNDO:
+            session.undo()
+        elif found is not None and found.changes is not None:
             session.step(found.label, **found.changes)
