@@ -67,6 +67,25 @@ DROP = """files => {
 STORED = "Object.keys(localStorage).find(key => key.endsWith('dt-viz'))"
 """Script that finds the name under which the browser keeps what was made on the page."""
 
+PHONE = (390, 844)
+"""Width and height of the window of a phone, CSS pixels."""
+BOX = """element => {
+    const {left, top, right, bottom} = element.getBoundingClientRect();
+    const seen = [Math.max(left, 0), Math.max(top, 0), Math.min(right, innerWidth), Math.min(bottom, innerHeight)];
+    const isFixed = inner => getComputedStyle(inner).position === 'fixed';
+    for (let inner = element; inner.parentElement && !isFixed(inner); inner = inner.parentElement) {
+        const around = inner.parentElement;
+        if (getComputedStyle(around).overflow === 'visible') continue;
+        const clip = around.getBoundingClientRect();
+        seen[0] = Math.max(seen[0], clip.left);
+        seen[1] = Math.max(seen[1], clip.top);
+        seen[2] = Math.min(seen[2], clip.right);
+        seen[3] = Math.min(seen[3], clip.bottom);
+    }
+    return {whole: [left, top, right, bottom], seen, spills: element.scrollWidth > element.clientWidth + 1};
+}"""
+"""An element's box, the part of it that nothing around it cuts off, and whether its own content is wider than it."""
+
 page_errors: list[str] = []
 """What pages have complained of in their consoles."""
 OF_OTHERS = ("Unable to preventDefault inside passive event listener", "GPU stall due to ReadPixels")

@@ -146,11 +146,11 @@ class ProtocolClient:
         return np.ptp(self.nodes.get(ROLLOUT, {}).get("vertices", 0)) > 0 and bool(self.status)
 
     def find(self, label: str) -> str:
-        """Return the identifier of the control with this label. Raises KeyError."""
-        for uuid, control in self.controls.items():
-            if control.get("label") == label:
-                return uuid
-        raise KeyError(label)
+        """Return the identifier of the control with this label, of several the first that is shown. Raises KeyError."""
+        shown = {uuid: one.get("visible", True) for uuid, one in self.controls.items() if one.get("label") == label}
+        if not shown:
+            raise KeyError(label)
+        return max(shown, key=shown.__getitem__)
 
     async def set(self, label: str, value: bool | float | str) -> None:
         """Set the value of a control."""

@@ -16,12 +16,33 @@ class History:
     """The scenarios before and after the present one. Whoever has it asks one thing at a time."""
 
     def __init__(self) -> None:
-        self._past: deque[Scenario] = deque(maxlen=MAX_UNDO)
-        self._future: list[Scenario] = []
+        self._past, self._future = deque[Scenario](maxlen=MAX_UNDO), list[Scenario]()
         self._gesture: tuple[str, float] = ("", 0.0)
         """Name of the gesture that is under way, and when it edited last."""
         self.held = False
         """Whether something is held, so that the gesture goes on however slow it is."""
+        self._aside: tuple[Scenario, deque[Scenario], list[Scenario]] | None = None
+        """What was set aside: the scenario, and those before and after it."""
+
+    @property
+    def aside(self) -> Scenario | None:
+        """The scenario that is set aside; None if none is."""
+        return None if self._aside is None else self._aside[0]
+
+    def set_aside(self, present: Scenario) -> None:
+        """Begin anew: the present scenario and its history are set aside, unless others are already."""
+        if self._aside is None:
+            self._aside = present, self._past, self._future
+        self._past, self._future = deque(maxlen=MAX_UNDO), []
+        self._gesture, self.held = ("", 0.0), False
+
+    def taken_back(self) -> Scenario | None:
+        """The scenario that was set aside, with its history; None if none was."""
+        if self._aside is None:
+            return None
+        own, self._past, self._future = self._aside
+        self._aside, self._gesture, self.held = None, ("", 0.0), False
+        return own
 
     @property
     def steps(self) -> tuple[bool, bool]:

@@ -239,6 +239,34 @@ class Session:
         """
         self._begin("load", self._as_seen(scenario(self.engine.task(task))))
 
+    def visit(self, task: str, scenario: Callable[[Task], Scenario]) -> None:
+        """Begin with a scenario for a task, with the present arm and a history of its own, until `come_back`.
+
+        Raises:
+            DemonstrationError: the task's demonstrations cannot be used; the session stays with what it has.
+        """
+        fresh = scenario(self.engine.task(task))
+        with self._lock:
+            self._history.set_aside(self.scenario)
+            self.scenario = replace(fresh, arm=self.scenario.arm, passing=ANEW)
+            self._submit()
+        self._adopt()
+
+    def come_back(self) -> None:
+        """Go on with the scenario that `visit` set aside, and its history, as if nothing had been since."""
+        self._travel(lambda _present: self._history.taken_back())
+
+    @property
+    def own(self) -> Scenario:
+        """The visitor's own scenario: the one that is set aside for a visit, or else the present one."""
+        with self._lock:
+            return self._history.aside or self.scenario
+
+    @property
+    def visits(self) -> bool:
+        """Whether a scenario is set aside."""
+        return self._history.aside is not None
+
     def _begin(self, gesture: str, fresh: Scenario, **changes: Any) -> None:  # noqa: ANN401 - the fields of Scenario
         own = {name: getattr(fresh, name) for name in fresh.__dataclass_fields__ if name not in ("arm", "passing")}
         self.step(gesture, anew=True, **own, **changes)
@@ -257,11 +285,11 @@ class Session:
 
     def undo(self) -> None:
         """Take the last gesture back."""
-        self._travel(self._history.undone)
+        self._travel(self._history.undone, seen=True)
 
     def redo(self) -> None:
         """Do again what was undone last."""
-        self._travel(self._history.redone)
+        self._travel(self._history.redone, seen=True)
 
     def cancel(self) -> None:
         """Stop learning a task, or loading an arm, and go back to what was shown; nothing is done without either."""
@@ -300,12 +328,13 @@ class Session:
         """Stop computing and let go of everything."""
         self.jobs.close()
 
-    def _travel(self, moved: Callable[[Scenario], Scenario | None]) -> None:
+    def _travel(self, moved: Callable[[Scenario], Scenario | None], *, seen: bool = False) -> None:
+        """Go to the scenario that the present one is `moved` to, if any; `seen` as what is shown now."""
         with self._lock:
             there = moved(self.scenario)
             if there is None:
                 return
-            self.scenario = self._as_seen(there)
+            self.scenario = self._as_seen(there) if seen else there
             self._submit()
         self._adopt()
 

@@ -154,7 +154,7 @@ class Bindings:
 
     def plays(
         self, buttons: Handle, gesture: str, chosen: Callable[[Session, str], Play | None], *, returns: bool = False
-    ) -> None:
+    ) -> Control:
         """Play what is `chosen` by a button of a group, which is one that stops it meanwhile; see `player.start`."""
         options = buttons.options
 
@@ -168,7 +168,7 @@ class Bindings:
             else:
                 player.start(session, gesture, play, show, returns=returns)
 
-        self.on(buttons, press)
+        return self.on(buttons, press)
 
     def on_command(self, command: Handle, act: Callable[[Session], None]) -> None:
         """Call `act`, which must only submit, when a command of the palette is given."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -23,9 +23,10 @@ from dt_viz.session.progress import Message, Progress
 from dt_viz.session.session import CHOICES, Session
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.controls import Control
+from dt_viz.ui.keeping import Storage
 from dt_viz.ui.pen import Pen
 from dt_viz.ui.playback import Playback
-from dt_viz.ui.scene.camera import CameraController
+from dt_viz.ui.scene.camera import CameraController, Pose
 from dt_viz.ui.scene.figure import render_figure
 from dt_viz.ui.scene.legend import Legend
 from dt_viz.ui.scene.palette import Colour
@@ -41,6 +42,7 @@ from dt_viz.ui.tabs.stack import StackPanel
 from dt_viz.ui.tabs.status import COLOURS, StatusLine, hint, hint_html, sentence
 from dt_viz.ui.tabs.teaching import TeachPanel
 from dt_viz.ui.tabs.timeline import PAST
+from dt_viz.ui.tabs.tour import NUMBERS, Tour
 from dt_viz.ui.tabs.world import add_obstacles, add_starts, add_transforms
 from dt_viz.warning import Severity
 
@@ -82,20 +84,24 @@ class ControlPanel:
         record: Callable[[Step], bytes] = lambda _step: b"",
         open_scenario: Callable[[str, bytes], bool] = lambda _name, _content: False,
         pen: Pen | None = None,
+        storage: Storage | None = None,
+        came_back: Callable[[Pose | None], None] = lambda _pose: None,
     ) -> None:
         """Build the controls, for the titles of tasks and arms by name; they act once `connect` has given a session.
 
         `render` makes a picture, see `PictureTab`; `send` sends a file whose name ends like this, with a content.
         `save` sends the scenario as a file and must only submit, `record` makes a page that replays what is shown,
         `open_scenario` goes on with the scenario of a file if it holds one. A visitor teaches with the `pen`.
+        The browser's `storage` keeps where the visitor is in the tour, at whose end `came_back` is called; see `Tour`.
         """
-        self._notify, self._begin_anew, self._titles = notify, (tripod.view, forget), dict(titles)
+        self._notify, self._titles = notify, dict(titles)
         self._notified: Message | None = None
         self._scenes = {scene.title: scene for scene in offered(self._titles)}
         self.bindings = bindings = Bindings()
         self.presentation = Presentation(gui, self._turn, lambda alone: tripod.reframe(alone=alone))
         bindings.show(self._title, lambda title: self.presentation.write(title=title))
         enlarge = big_type(gui, tripod)
+        self.tour = Tour(gui, bindings, tripod, self.choose, storage, came_back)
         opening, self._scene = self._add_choices(
             gui, preview, lambda name, content: open_scenario(name, content) or loader.takes(name, content), send
         )
@@ -104,7 +110,8 @@ class ControlPanel:
         self.hint = gui.add_html(hint_html(""))
         add_avoid_and_imitate(gui, bindings)
         self.status = StatusLine(gui, bindings)
-        travels = {"Undo": Session.undo, "Redo": Session.redo, "Reset": self._reset, "Save": save}
+        reset = partial(self._reset, (tripod.view, forget))
+        travels = {"Undo": Session.undo, "Redo": Session.redo, "Reset": reset, "Save": save}
         buttons = gui.add_button_group("History", tuple(travels), hint=SAVE_HINT)
         bindings.on(buttons, lambda session, button: travels[button](session))
         gui.add_html(STYLE)
@@ -125,9 +132,9 @@ class ControlPanel:
         with tabs.add_tab("Picture"):
             act = {"darken": darken, "enlarge": enlarge, "render": render, "draw": self._draw, "record": record}
             picture = PictureTab(gui, bindings, tripod, self.presentation, send=send, **act)
-        commands = self._commands(gui.main_panel, picture, save, opening)
+        commands = self._commands(gui.main_panel, picture, reset, save, opening)
         add_commands(gui, bindings, commands)
-        add_about(gui, commands)
+        add_about(gui, bindings, commands, self.tour.take)
         self.take(robot)
 
     def take(self, robot: Robot) -> None:
@@ -166,8 +173,9 @@ class ControlPanel:
         """Show the verdict on what is shown, its hint, and a message, which is for a while beside the panel, too."""
         self.status.tell(progress)
         text = "" if progress.shown is None or progress.stale else hint(progress.shown)
-        self.hint.content = hint_html(text)
-        self.presentation.write(caption=text)
+        step = self.tour.step
+        self.hint.content = hint_html(text if step is None else "")
+        self.presentation.write(caption=text if step is None else step.text)
         message = progress.message
         if message is not None and message is not self._notified:
             self._notify(sentence(message.text), COLOURS[message.severity][0])
@@ -222,12 +230,16 @@ class ControlPanel:
         self.begin(begin, session, "")
 
     def _title(self, scenario: Scenario) -> str:
+        if self.tour.step is not None:
+            return self.tour.step.title
         return SCENES[scenario.scene].title if scenario.scene in SCENES else self._titles[scenario.task]
 
     def _turn(self, step: int) -> None:
-        """Go to a scene so many places after the shown one; before the first is the last."""
+        """Go to a scene so many places after the shown one, before the first is the last; or to a step of the tour."""
         scenario, titles = self.bindings.scenario, tuple(self._scenes)
-        if scenario is not None:
+        if self.tour.step is not None:
+            self.tour.turn(self.bindings.session, step)
+        elif scenario is not None:
             title = self._title(scenario)
             shown = titles.index(title) if title in titles else min(-step, 0)
             self.begin(self._load, self.bindings.session, titles[(shown + step) % len(titles)])
@@ -241,19 +253,30 @@ class ControlPanel:
             session.say(f"“{title}” is made for the JACO: choose it in Arm → Model.", Severity.WARNING)
 
     def follow(self, session: Session, link: Link) -> None:
-        """Begin the scene or the task that a link asks for; where there is none, say so."""
+        """Begin the scene, the task or the tour that a link asks for; where there is none, say so."""
         scene = found(link.name, self._scenes.values()) if link.kind == "scene" else None
-        names = self._titles if link.kind == "task" else [each.name for each in self._scenes.values()]
+        names = {"scene": [each.name for each in self._scenes.values()], "task": self._titles, "tour": NUMBERS}
         if scene is not None:
             self.begin(self._load, session, scene.title)
         elif link.kind == "task" and link.name in self._titles:
             self.begin(lambda session, _title: session.begin_task(link.name), session, self._titles[link.name])
+        elif link.kind == "tour" and link.name in ("", *NUMBERS):
+            self.tour.take(session, int(link.name or 1) - 1)
         else:
-            text = f"The link: {link.kind}: found {link.name!r}; accepted: {', '.join(names)}"
+            text = f"The link: {link.kind}: found {link.name!r}; accepted: {', '.join(names[link.kind])}"
             session.say(text, Severity.WARNING)
 
     def begin(self, begin: Callable[[Session, str], None], session: Session, title: str) -> None:
-        """Begin a task, a scene or an arm beside the server's event loop; if that fails, show why and stay."""
+        """Begin a task, a scene or an arm, with the visitor's own scenario where the tour was on; see `choose`."""
+
+        def own(session: Session, title: str) -> None:
+            self.tour.leave(session)
+            begin(session, title)
+
+        self.choose(own, session, title)
+
+    def choose(self, begin: Callable[[Session, str], None], session: Session, title: str) -> None:
+        """Begin something beside the server's event loop; if that fails, show why and stay."""
 
         def work() -> None:
             session.expect(True)
@@ -279,6 +302,7 @@ class ControlPanel:
         self,
         panel: Any,  # noqa: ANN401 - viser's, without a name
         picture: PictureTab,
+        reset: Callable[[Session], None],
         save: Callable[[Session], None],
         opening: OpenPanel,
     ) -> list[Command]:
@@ -290,26 +314,33 @@ class ControlPanel:
                 folded = not folded
                 (panel.minimize if folded else panel.expand)()
 
-        def leave(_session: Session) -> None:
+        def leave(session: Session) -> None:
+            if not (self.presentation.on or opening.folder.visible):
+                self.tour.end(session)
             self.presentation.show(False)
             opening.later(opening.close)
 
         return [
             *self.show.timeline.commands,
-            Command("Reset the scene and the camera", self._reset, "R"),
+            Command("Reset the scene and the camera", reset, "R"),
             Command("Undo", Session.undo, "Z"),
             Command("Redo", Session.redo, "Z", shifted=True),
             Command("Save the scenario as a file", save),
             *picture.commands,
+            Command("Take the tour", self.tour.take),
             Command("Hide the panel, or show it", fold, "H"),
-            Command("End the presentation, and what is taught or opened", leave, "escape"),
+            Command("End the presentation, what is taught or opened, or else the tour", leave, "escape"),
             *self.presentation.commands,
             *numbered(tuple(self._scenes), partial(self.begin, self._load)),
         ]
 
-    def _reset(self, session: Session) -> None:
+    def _reset(self, begin_anew: Iterable[Callable[[], None]], session: Session) -> None:
+        """Reset the session, and what else begins anew; in the tour, begin the step anew."""
+        if self.tour.step is not None:
+            self.tour.turn(session, 0)
+            return
         session.reset()
-        for begin in self._begin_anew:
+        for begin in begin_anew:
             begin()
 
 

@@ -31,10 +31,10 @@ LONGEST = 100
 """Largest number of characters of a name in a link."""
 MEASURE = """
 clearTimeout(window.dtVizTells);
-removeEventListener('resize', window.dtVizResized);
+window.removeEventListener('resize', window.dtVizResized);
 const tell = () => fetch('ADDRESS/' + innerWidth, {cache: 'no-store'});
 window.dtVizResized = () => { clearTimeout(window.dtVizTells); window.dtVizTells = setTimeout(tell, 200); };
-addEventListener('resize', window.dtVizResized);
+window.addEventListener('resize', window.dtVizResized);
 tell();
 const page = new window.URL(location.href), kinds = KINDS.filter(kind => page.searchParams.has(kind));
 for (const kind of kinds.slice(0, 1))
@@ -125,8 +125,27 @@ window.dtVizForget = () => {
 """
 """Sends files; BUTTON is the button's name in the page, MOST the largest number of bytes of a file."""
 
-KINDS = ("scene", "task")
-"""Kinds of things that a link may name."""
+ARROWS = """
+const mark = this.parentElement, names = {ArrowLeft: BACK, ArrowRight: NEXT};
+const press = event => {
+  if (!mark.isConnected) return window.removeEventListener('keydown', press, true);
+  const other = event.altKey || event.ctrlKey || event.metaKey || event.shiftKey;
+  const taken = event.target.matches?.('input, textarea, select, [contenteditable], [role]');
+  if (!names[event.key] || other || taken) return;
+  event.stopPropagation();
+  const buttons = event.repeat ? [] : Array.from(mark.nextElementSibling?.querySelectorAll('button') ?? []);
+  buttons.find(button => button.textContent.trim() === names[event.key])?.click();
+};
+window.addEventListener('keydown', press, true);
+mark.parentElement.firstElementChild.scrollIntoView({block: 'nearest'});
+"""
+"""Has the keys left and right press the buttons BACK and NEXT of the group that comes next, while they are there.
+
+The page's camera, which these keys turn too, does not hear of it; what is typed in, and sliders, keep them.
+"""
+
+KINDS = ("scene", "task", "tour")
+"""Kinds of things that a link may ask for."""
 
 
 @dataclass(frozen=True)
@@ -136,6 +155,7 @@ class Link:
     kind: str
     """One of `KINDS`."""
     name: str
+    """Name of a scene or a task, or number of a step of the tour, from 1; the first one if empty."""
 
 
 Told = Callable[[str, "float | Link"], None]
@@ -157,7 +177,7 @@ class Ruler:
 
 def told(path: str) -> tuple[str, float | Link] | None:
     """Return the token, and the width, CSS pixels, or the link that a request's path tells; None if it tells none."""
-    asked = re.search(rf"/{FOLDER}/([\w-]+)/({'|'.join(KINDS)})/([\w.!~*'()%-]{{1,{LONGEST}}})$", path, re.ASCII)
+    asked = re.search(rf"/{FOLDER}/([\w-]+)/({'|'.join(KINDS)})/([\w.!~*'()%-]{{0,{LONGEST}}})$", path, re.ASCII)
     if asked:
         return asked[1], Link(asked[2], unquote(asked[3])[:LONGEST])
     found = re.search(rf"/{FOLDER}/([\w-]+)/(\d{{3,5}})$", path, re.ASCII)
@@ -167,6 +187,11 @@ def told(path: str) -> tuple[str, float | Link] | None:
 def drop_html(button: viser.GuiUploadButtonHandle, most: int) -> str:
     """Return what is to stand beside an upload button on the page, unseen; files are of so many bytes at most."""
     return _run(DROP.replace("BUTTON", repr(patches.name_of(button))).replace("MOST", str(most)))
+
+
+def arrows_html(back: str, following: str) -> str:
+    """Return what is to stand before a group of buttons on the page, unseen; these are the names of two of them."""
+    return _run(ARROWS.replace("BACK", repr(back)).replace("NEXT", repr(following)))
 
 
 def _run(script: str) -> str:

@@ -19,7 +19,7 @@ from dt_viz.obstacles.shapes import Sphere, TriangleObstacle, as_point
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.own import Own
 from dt_viz.scenario.relocation import in_world
-from dt_viz.scenario.saved import Known, Saved, encode, is_saved
+from dt_viz.scenario.saved import Known, Saved, Sight, encode, is_saved
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.stack import with_avoidance
@@ -38,7 +38,7 @@ from dt_viz.ui.keeping import Keeper
 from dt_viz.ui.panel import ControlPanel
 from dt_viz.ui.pen import Pen
 from dt_viz.ui.playback import Playback
-from dt_viz.ui.scene.camera import CameraController, Framing, shot_of, view_of
+from dt_viz.ui.scene.camera import CameraController, Framing, Pose, shot_of, view_of
 from dt_viz.ui.scene.export import RESOLUTIONS, render_png
 from dt_viz.ui.scene.key import Key
 from dt_viz.ui.scene.legend import Legend
@@ -69,6 +69,10 @@ def _takes_long(saved: Saved) -> bool:
     """Whether another arm, surfaces of obstacles, or a task are to be made for a scenario before it is shown."""
     shapes = any(isinstance(obstacle, TriangleObstacle) for obstacle in saved.scenario.obstacles)
     return bool(saved.scenario.arm) or saved.own is not None or shapes
+
+
+def _sight(pose: Pose | None) -> Sight | None:
+    return None if pose is None else (as_point(pose[0]), as_point(pose[1]))
 
 
 def notify(client: viser.ClientHandle, text: str, colour: Colour) -> None:
@@ -126,6 +130,8 @@ class Visitor(Display):
             self._record,
             self._open,
             pen,
+            client.local_storage,
+            self._came_back,
         )
         begun = self._keeper.begun
         at_once = None if begun is None or _takes_long(begun) else begun.scenario
@@ -133,6 +139,7 @@ class Visitor(Display):
         self.session = Session(engine, initial_scenario, task, display, arms and arms.engine, at_once, account)
         self._panel.connect(self.session)
         self._keeper.begin(self.session, self._resume)
+        self._panel.tour.begin(self.session)
         self.ruler = Ruler()
         """What the visitor's window is measured with."""
         self.robot.playback.begin(self.session.jobs, self.session.fail)
@@ -161,6 +168,7 @@ class Visitor(Display):
             self._camera.look(frame.task, beside)
         if (sight := self._keeper.sight(frame)) is not None:
             self._camera.choose((np.array(sight[0]), np.array(sight[1])))
+            self._keeper.changed()
         with self.client.atomic():
             self.pictures.draw(frame)
             self.robot.draw(frame, self.pictures.look)
@@ -187,10 +195,15 @@ class Visitor(Display):
         self.session.close()
 
     def _made(self, tasks: Collection[str]) -> Saved:
-        """What the visitor has made, with the task unless it is one of these."""
-        pose, scenario = self._camera.chosen, self.session.scenario
+        """What the visitor has made, beside the tour, with the task unless it is one of these."""
+        pose = self._panel.tour.pose if self.session.visits else self._camera.chosen
+        scenario = self.session.own
         own = None if scenario.task in tasks else Own.of(self.session.engines(scenario.arm).task(scenario.task))
-        return Saved(scenario, None if pose is None else (as_point(pose[0]), as_point(pose[1])), own)
+        return Saved(scenario, _sight(pose), own)
+
+    def _came_back(self, pose: Pose | None) -> None:
+        """Have the camera where it was before the tour, with the visitor's own scenario."""
+        self._keeper.go_on(Saved(self.session.own, _sight(pose)))
 
     def _resume(self, saved: Saved) -> None:
         """Go on with what was saved, beside the server's event loop."""

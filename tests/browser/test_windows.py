@@ -8,8 +8,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from browsing import (
+    BOX,
     LIGHT,
     PATIENCE,
+    PHONE,
     TRIES,
     begin,
     close_notices,
@@ -26,7 +28,7 @@ from pages import camera_for
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui.tabs.picture import LARGER
 
-PHONE, PROJECTOR, LAPTOP, PHONE_ON_ITS_SIDE = (390, 844), (1920, 1080), (1280, 720), (844, 390)
+PROJECTOR, LAPTOP, PHONE_ON_ITS_SIDE = (1920, 1080), (1280, 720), (844, 390)
 
 NEAR = 8.0
 """Accepted distance of what is dragged from the finger, pixels."""
@@ -34,23 +36,6 @@ LATE = 5.0
 """Time that the events of a drag may take, seconds."""
 
 pytestmark = [pytest.mark.browser, needs_chromium]
-
-BOX = """element => {
-    const {left, top, right, bottom} = element.getBoundingClientRect();
-    const seen = [Math.max(left, 0), Math.max(top, 0), Math.min(right, innerWidth), Math.min(bottom, innerHeight)];
-    const isFixed = inner => getComputedStyle(inner).position === 'fixed';
-    for (let inner = element; inner.parentElement && !isFixed(inner); inner = inner.parentElement) {
-        const around = inner.parentElement;
-        if (getComputedStyle(around).overflow === 'visible') continue;
-        const clip = around.getBoundingClientRect();
-        seen[0] = Math.max(seen[0], clip.left);
-        seen[1] = Math.max(seen[1], clip.top);
-        seen[2] = Math.min(seen[2], clip.right);
-        seen[3] = Math.min(seen[3], clip.bottom);
-    }
-    return {whole: [left, top, right, bottom], seen, spills: element.scrollWidth > element.clientWidth + 1};
-}"""
-"""An element's box, the part of it that nothing around it cuts off, and whether its own content is wider than it."""
 
 
 @pytest.fixture(scope="module")

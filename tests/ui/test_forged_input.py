@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import viser  # noqa: TID251 - forges what a browser sends
-from pages import CLIENT, MIDDLE, Page, wait_until
+from pages import CLIENT, MIDDLE, PATIENCE, Page, wait_until
 from viser import _messages as messages  # noqa: TID251
 
 from dt_viz.avoidance.detour import DetourSettings
@@ -22,6 +22,7 @@ from dt_viz.session.session import CHOICES
 from dt_viz.ui import controls, gestures
 from dt_viz.ui.scene import markers
 from dt_viz.ui.scene.camera import view_of
+from dt_viz.ui.tabs.tour import LANE
 
 SCENES = offered(TASKS)
 BORDERS = {controls.__name__, gestures.__name__, markers.__name__}
@@ -39,8 +40,12 @@ TURNS = [(0.0,) * 4, (math.nan, 0.0, 0.0, 0.0), (1e300, 0.0, 0.0, 0.0), (1.0, 0.
 
 @pytest.fixture(autouse=True)
 def _at_rest(page):
-    """No presentation, and a camera that stays where it is put: something forged may have begun others."""
+    """No presentation, no tour, and a camera that stays where it is put: something forged may have begun others."""
     page.visitor._panel.presentation.show(False)
+    for lane in (LANE, CHOICES):
+        assert page.session.jobs.wait_idle(lane, PATIENCE)
+    page.visitor._panel.tour.end(page.session)
+    assert page.session.jobs.wait_idle(CHOICES, PATIENCE)
     for switch in page.inputs:
         if switch.label in ("Orbit", "Lock camera") and switch.value:
             page.claim(switch, False)

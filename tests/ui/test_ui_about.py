@@ -21,6 +21,7 @@ def test_the_keys_are_those_of_the_commands():
     assert rows == [
         ("Z", "Undo"),
         ("Shift Z", "Redo"),
+        ("← →", "previous and next step of the tour"),
         ("1 – 9", "scenes, in their order"),
         ("Ctrl K", "all commands by name"),
     ]

@@ -72,9 +72,13 @@ def add_commands(gui: viser.GuiApi, bindings: Bindings, commands: Sequence[Comma
         bindings.on_command(handle, command.act)
 
 
-def add_about(gui: viser.GuiApi, commands: Sequence[Command]) -> None:
-    """Build the folder "About" where the panel is being built, closed."""
+def add_about(
+    gui: viser.GuiApi, bindings: Bindings, commands: Sequence[Command], take_tour: Callable[[Session], None]
+) -> None:
+    """Build the folder "About" where the panel is being built, closed; `take_tour` must only submit."""
     with gui.add_folder("About: paper, colours, keys", expand_by_default=False):
+        tour = gui.add_button("Take the tour", icon=viser.Icon.ROUTE, hint="six steps; it begins anew")
+        bindings.on(tour, lambda session, _pressed: take_tour(session))
         link = f"<a href='{LINK}' target='_blank' rel='noopener noreferrer' style='font-weight:600'>{TITLE}</a>"
         gui.add_html(small(f"{link}<br/>{AUTHORS}<br/>{VENUE}") + legend_html() + keys_html(commands))
 
@@ -93,7 +97,8 @@ def legend_html() -> str:
 def keys_html(commands: Sequence[Command]) -> str:
     """Return the keys of the commands; the scenes on the digits are one line."""
     keys = {command.keys: command.label for command in commands if command.key and not command.key.isdecimal()}
-    keys |= {"1 – 9": "scenes, in their order", "Ctrl K": "all commands by name"}
+    keys |= {"← →": "previous and next step of the tour", "1 – 9": "scenes, in their order"}
+    keys |= {"Ctrl K": "all commands by name"}
     rows = "".join(
         f"<tr><td style='white-space:nowrap;padding-right:0.9em;font-weight:600'>{key}</td>"
         f"<td>{html.escape(text)}</td></tr>"

@@ -36,6 +36,7 @@ from dt_viz.scenario.tasks import STYLES
 from dt_viz.session.frame import Frame
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import Bindings
+from dt_viz.ui.controls import Control
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.palette import Colour
 from dt_viz.ui.scene.rollouts import manifold
@@ -44,7 +45,7 @@ from dt_viz.ui.tabs.settings import add_settings, settings_of_purpose
 
 BASE = "Base attractor"
 ON, OFF, UP, DOWN, SHOW, SHOWN = "● on", "○ off", "↑", "↓", "show", "● shown"
-WARP = "Warp"
+WARP, PLAY = "Warp", "▶ 0 → 1"
 SECONDS = 5.0
 """Duration of playing the warp."""
 NO_STYLE = "–"
@@ -194,12 +195,12 @@ _ACTIONS: dict[str, Callable[[Scenario, str], dict[str, Any]]] = {
 }
 
 
-def add_warp(gui: viser.GuiApi, bindings: Bindings, order: float) -> None:
-    """Build the slider of the warp and the button that plays it, from an order in their folder on."""
+def add_warp(gui: viser.GuiApi, bindings: Bindings, order: float | None = None) -> tuple[Control, Control]:
+    """Build the slider of the warp and the button that plays it, from an order on; return both."""
     hint = "part of its time that each flow runs. 0: motions and space are straight; 1: the stack is complete"
-    bindings.field(gui.add_slider(WARP, 0.0, 1.0, 0.01, 1.0, order=order, hint=hint), "warp")
-    play = gui.add_button_group("Play warp", ("▶ 0 → 1",), order=order + 1)
-    bindings.plays(play, WARP, lambda _session, _button: grown)
+    slider = gui.add_slider(WARP, 0.0, 1.0, 0.01, 1.0, order=order, hint=hint)
+    play = gui.add_button_group("Play warp", (PLAY,), order=None if order is None else order + 1)
+    return bindings.field(slider, "warp"), bindings.plays(play, WARP, lambda _session, _button: grown)
 
 
 def grown(scenario: Scenario, seconds: float) -> dict[str, float] | None:
