@@ -3,6 +3,7 @@
 dt-viz picture fig-4 --out fig4.png --size 3840x2160
 dt-viz picture draw_s --out s.svg
 dt-viz picture fig-4 --out fig4.html
+dt-viz picture tour-2 --out warp.png
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ SETTINGS = PictureSettings()
 def main(arguments: Sequence[str], prog: str) -> int:
     """Make a picture; returns the process' exit status, or raises SystemExit where argparse does."""
     parser = argparse.ArgumentParser(prog=prog, description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("scene", metavar="SCENE", help="a scene, such as fig-4 or its name, or a task")
+    parser.add_argument("scene", metavar="SCENE", help="a scene, such as fig-4 or its name, a task, or tour-1 to 6")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="a .png, .svg, .pdf or .html")
     parser.add_argument("--size", default="1920x1080", metavar="WxH", help="pixels of a PNG (default: %(default)s)")
     options = parser.parse_args(arguments)
@@ -115,18 +116,26 @@ def _maker(out: Path, size: str) -> Callable[[str, Callable[[Task], Scenario]], 
 
 
 def _chosen(name: str) -> tuple[str, Callable[[Task], Scenario]]:
-    """Return the task, and what makes the scenario, of a scene or a task; raises FormatError if there is neither."""
+    """Return the task, and what makes the scenario, of a scene, a task or a step of the tour.
+
+    Raises:
+        FormatError: there is none of that name.
+    """
     from dt_viz.errors import FormatError  # noqa: PLC0415
     from dt_viz.scenario.paper_scenes import found, offered  # noqa: PLC0415
     from dt_viz.scenario.tasks import TASKS  # noqa: PLC0415
+    from dt_viz.scenario.tour import STEPS, TASK  # noqa: PLC0415
     from dt_viz.ui.visitor import initial  # noqa: PLC0415
 
     scenes = offered(TASKS)
     scene = found(name, scenes) if name else None
     if scene is not None:
         return scene.task, scene.scenario
+    steps = {f"tour-{number}": step.ended for number, step in enumerate(STEPS, start=1)}
+    if name in steps:
+        return TASK, steps[name]
     if name not in TASKS:
-        raise FormatError("SCENE", repr(name), ", ".join((*(each.name for each in scenes), *TASKS)))
+        raise FormatError("SCENE", repr(name), ", ".join((*(each.name for each in scenes), *TASKS, *steps)))
     return name, initial
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from browsing import UNHURRIED
 from chromium import needs_chromium
 from PIL import Image
 
@@ -115,8 +116,10 @@ def see_the_motion(browser, address, patience):
     page = browser.new_page(viewport={"width": 900, "height": 560})
     try:
         page.set_default_timeout(1000 * patience)
+        page.add_init_script(UNHURRIED)
         page.goto(address)
         page.get_by_text("· stable ·").wait_for()
+        page.evaluate("isLookedAt = true")
         while num_rollout_pixels(page.screenshot()) < 300:
             if time.monotonic() > deadline:
                 pytest.fail("the picture shows no rollout")

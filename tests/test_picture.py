@@ -58,11 +58,13 @@ def test_a_browser_that_opens_nothing_is_given_up(does, said, capsys, tmp_path, 
     assert [*tmp_path.iterdir()] == [browser]
 
 
-def test_a_scene_is_drawn_as_lines_and_text(tmp_path, cache, monkeypatch):
+def test_a_scene_and_a_step_of_the_tour_are_drawn_as_lines_and_text(tmp_path, cache, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
     assert main(["picture", "fig-2", "--out", str(tmp_path / "f.svg")]) == 0
     svg = (tmp_path / "f.svg").read_text()
     assert all(f">{title}</text>" in svg for title in ("base attractor", "imitation", "+ avoidance", "rollouts"))
+    assert main(["picture", "tour-4", "--out", str(tmp_path / "g.svg")]) == 0
+    assert ">obstacle</text>" in (tmp_path / "g.svg").read_text()
 
 
 @needs_chromium

@@ -49,6 +49,11 @@ class TourStep:
         """Return the scenario for the task of the tour."""
         return replace(self.make(task), view=replace(View(), **self.view))
 
+    def ended(self, task: Task) -> Scenario:
+        """Return the scenario once its warp has grown."""
+        scenario = self.scenario(task)
+        return replace(scenario, warp=1.0) if self.grows else scenario
+
 
 def _unwarped(task: Task) -> Scenario:
     return Scenario(task.name, (), warp=0.0)
