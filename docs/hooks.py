@@ -11,7 +11,7 @@ from mkdocs.structure.files import File, Files
 from dt_viz.picture import main as picture
 
 ASSETS = Path(__file__).parents[1] / "assets"
-REPLAYS = ("fig-7",)
+REPLAYS = ("lift",)
 """Names of the scenes that are embedded."""
 
 
