@@ -250,6 +250,18 @@ def semantic_homes(semantic: Element | None, joint_names: Sequence[str]) -> list
     return found
 
 
+def checked_home(given: Array, joint_names: Sequence[str], lower: Array, upper: Array) -> Array:
+    """Return a posture (n,), rad, that is given; raises FormatError if it is none within the limits."""
+    if given.shape != lower.shape or not np.isfinite(given).all():
+        raise FormatError("home", f"{given.shape} numbers", f"{len(lower)} angles, rad, of {listed(joint_names)}")
+    outside = [name for name, bad in zip(joint_names, (given < lower) | (given > upper), strict=True) if bad]
+    if outside:
+        ranges = zip(joint_names, lower, upper, strict=True)
+        accepted = ", ".join(f"{name} from {low:.2f} to {high:.2f}" for name, low, high in ranges if name in outside)
+        raise FormatError("home", f"{given.round(3).tolist()} rad", accepted)
+    return given
+
+
 def find_home(
     search: HomeSearch,
     joint_names: Sequence[str],
@@ -258,21 +270,8 @@ def find_home(
     given: Array | None,
     semantic: Element | None,
 ) -> tuple[Array, str]:
-    """Find the ready posture (n,), rad: given, a state of the SRDF, or searched for; and say why.
-
-    Raises:
-        FormatError: What is given is none within the limits.
-    """
+    """Find the ready posture (n,), rad: given, a state of the SRDF, or searched for; and say why."""
     if given is not None:
-        if given.shape != lower.shape or not np.isfinite(given).all():
-            raise FormatError("home", f"{given.shape} numbers", f"{len(lower)} angles, rad, of {listed(joint_names)}")
-        outside = [name for name, bad in zip(joint_names, (given < lower) | (given > upper), strict=True) if bad]
-        if outside:
-            ranges = zip(joint_names, lower, upper, strict=True)
-            accepted = ", ".join(
-                f"{name} from {low:.2f} to {high:.2f}" for name, low, high in ranges if name in outside
-            )
-            raise FormatError("home", f"{given.round(3).tolist()} rad", accepted)
         return given, "given"
     told = []
     for name, posture in semantic_homes(semantic, joint_names):

@@ -21,6 +21,7 @@ from dt_viz.robot.choices import (
     ArmSearchSettings,
     HomeSearch,
     Ranges,
+    checked_home,
     count_fixed,
     find_front,
     find_home,
@@ -281,7 +282,8 @@ class _Given:
             tell(0.02, "reading the meshes")
             shapes = read_shapes(text, chain)
             lower, upper, velocity = np.array([joint.limits for joint in chain.joints]).T
-            home = None if self.home is None else np.array(self.home)
+            names = tuple(joint.name for joint in chain.joints)
+            home = None if self.home is None else checked_home(np.array(self.home), names, lower, upper)
             ranges = Ranges.of(lower, upper)
             front, front_why = find_front(shapes.kinematics, ranges, self.front, home, self.choice)
             base = to_front(front)
@@ -312,7 +314,6 @@ class _Given:
             tell(0.85, "looking for a ready pose")
             solids.touching = touching
             search = HomeSearch(arm, body, solids, ranges, self.choice)
-            names = tuple(joint.name for joint in chain.joints)
             posture, home_why = find_home(search, names, lower, upper, home, semantic)
             levers = np.array(self.levers) if self.levers else find_levers(arm, posture, lower, upper, self.choice)
         locked = ", ".join(f"{joint} at {value:.3g}" for joint, value in chain.locked.items()) or "none"

@@ -175,6 +175,13 @@ def test_what_is_given_is_checked(tmp_path, given, words):
     assert [word for word in words if word not in str(told.value)] == [], told.value
 
 
+def test_nothing_is_computed_from_a_posture_of_too_few_angles(tmp_path, monkeypatch):
+    """A compiled loop would read beyond its end."""
+    monkeypatch.setattr("dt_viz.robot.models.find_front", None)
+    with pytest.raises(ArmError, match="4 angles"):
+        robot_from_urdf(write(tmp_path, urdf(4)), home=(0, 0))
+
+
 def test_a_damaged_mesh_is_told(tmp_path):
     write(tmp_path, b"solid nothing" * 10, "broken.stl")
     with pytest.raises(ArmError, match=r"mesh: found .*; accepted: "):

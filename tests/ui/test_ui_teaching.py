@@ -110,7 +110,7 @@ def test_cancel_escape_and_another_task_end_it(teaching):
     page = teaching.page
     for leave in (
         lambda: teaching.choose("Cancel"),
-        lambda: page.give(page.commands["End the presentation, and what is taught or opened"]),
+        lambda: page.give(page.commands["End the presentation, what is taught or opened, or else the tour"]),
         lambda: teaching.choose("Task", "Draw J"),
     ):
         teaching.choose("Draw your own")

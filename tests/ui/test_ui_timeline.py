@@ -30,7 +30,7 @@ class Watched:
         self.playback.replay.motion = ArmMotion(TIMES, Q + page.session.robot.home, Q + page.session.robot.home)
         replay = self.playback.replay
         replay.playing, replay.loops, replay.speed = True, True, 1.0
-        wait_until(lambda: not self.timeline.panel.visible)
+        wait_until(lambda: self.timeline._playback is not None and not self.timeline.panel.visible)
         self.timeline._source.value = LIVE  # or what a test has shown before is no news
 
     @property
@@ -186,6 +186,7 @@ def test_plots_are_marked_at_the_moment_that_is_shown(watched):
     )
     assert marked() == {}
     watched.claim("Shown", REPLAY)
+    watched.shows(REPLAY)  # and how long it is
     watched.claim("Time [s]", 0.5)
     wait_until(lambda: marked().get("time") == 0.25)
     assert marked()["path"] == pytest.approx(0.25, abs=1e-3)
