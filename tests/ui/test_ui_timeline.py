@@ -187,6 +187,7 @@ def test_plots_are_marked_at_the_moment_that_is_shown(watched):
     assert marked() == {}
     watched.claim("Shown", REPLAY)
     watched.shows(REPLAY)  # and how long it is
+    watched.player.playing = False
     watched.claim("Time [s]", 0.5)
     wait_until(lambda: marked().get("time") == 0.25)
     assert marked()["path"] == pytest.approx(0.25, abs=1e-3)

@@ -17,7 +17,7 @@ from dt_viz.ui.controls import Control
 from dt_viz.ui.playback import Playback, Replay
 from dt_viz.ui.tabs.about import Command
 from dt_viz.ui.tabs.arm import play_or_pause
-from dt_viz.ui.tabs.plots import Plots
+from dt_viz.ui.tabs.plots import Plots, cursor_html
 from dt_viz.warning import Severity
 
 LIVE, REPLAY, PAST = "Live", "Replay", f"Last {SPAN:.0f} s"
@@ -47,7 +47,7 @@ class Timeline:
         self.panel.float(x=15, y=-15, width=WIDTH)
         with self.panel.add_tab("Timeline"):
             gui.add_html(AT_THE_FOOT)
-            self._mark = gui.add_html("")
+            self._mark = gui.add_html(cursor_html())
             hint = (
                 f"{REPLAY}: the finished motion, which follows your edits. {PAST}: what the robot did, which edits "
                 f"leave as it is; the robot goes on meanwhile. {LIVE}: the robot again"
@@ -107,7 +107,9 @@ class Timeline:
         self._source.value = PAST if player is playback.past else REPLAY
         self._buttons.options = (BACK, PAUSE if player.playing else PLAY, ON)
         self._moment.handle.max = max(0.01, math.ceil(100 * player.duration) / 100)
-        self._moment.value = round(player.moment, 2)
+        moment = round(player.moment, 2)
+        if moment != self._moment.value:  # what a visitor moves it to meanwhile is not put back while nothing plays
+            self._moment.value = moment
         self._loops.value, self._speed.value = player.loops, player.speed
         if not self.panel.visible:
             self.panel.visible = True
