@@ -60,7 +60,8 @@ def test_a_gizmo_that_is_moved_is_not_echoed_to_the_browser_that_moves_it(page, 
     sent.clear()
     page.move(name, (0.12, -0.52, 0.41))
     assert page.session.scenario != before
-    assert bool(sent) == echoes
+    # its own thread, and pages of other tests, may send what their arms do meanwhile
+    assert any(str(getattr(message, "name", "")).startswith(name) for message in sent) == echoes
 
 
 def test_an_input_that_is_moved_is_not_echoed_to_the_browser_that_moves_it(page, sent, echoes):
