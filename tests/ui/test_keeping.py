@@ -77,24 +77,6 @@ class Full(Browser):
 
 
 @pytest.fixture
-def opened(server, robot):
-    """Opens pages for browsers."""
-    pages = []
-
-    def opens(browser: Any) -> Page:
-        server.gui.reset()
-        server.scene.reset()
-        pages.append(Page(server, robot, kept=browser))
-        return pages[-1]
-
-    yield opens
-    for page in pages:
-        page.close()
-    server.gui.reset()
-    server.scene.reset()
-
-
-@pytest.fixture
 def another():
     server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     yield server
@@ -118,22 +100,22 @@ def made(camera: Any = None, scenario: Scenario = MADE) -> str:
     return encode(Saved(scenario, camera))
 
 
-def test_each_edit_is_kept_and_the_next_page_begins_with_it(opened):
+def test_each_edit_is_kept_and_the_next_page_begins_with_it(opened_for):
     browser = Browser()
-    page = opened(browser)
+    page = opened_for(browser)
     settled(page)
     assert browser.told == []  # nothing is edited yet
     page.begin(MADE)
     settled(page)
     assert kept(browser) == Saved(MADE)
-    again = opened(Browser(**browser))
+    again = opened_for(Browser(**browser))
     assert again.session.scenario == MADE and message(again) == ""
     settled(again)
     assert again.client.local_storage.told == []
 
 
-def test_the_line_of_status_says_so_until_the_next_edit(opened):
-    page = opened(Browser(**{KEY: made()}))
+def test_the_line_of_status_says_so_until_the_next_edit(opened_for):
+    page = opened_for(Browser(**{KEY: made()}))
     progress = replace(page.session._screen.progress, shown=frame_of(MADE, task=None, rollouts=()))
     assert progress.restored == progress.wanted == MADE
     assert "restored" in verdict(progress).line.split(" · ")
@@ -143,9 +125,9 @@ def test_the_line_of_status_says_so_until_the_next_edit(opened):
     assert "restored" not in verdict(replace(progress, restored=None)).line
 
 
-def test_the_newest_is_kept_at_most_twice_a_second(opened):
+def test_the_newest_is_kept_at_most_twice_a_second(opened_for):
     browser = Browser()
-    page = opened(browser)
+    page = opened_for(browser)
     warps, began = np.linspace(0.9, 0.1, 60), time.monotonic()
     for warp in warps:
         page.session.edit("Warp", warp=float(warp))
@@ -158,10 +140,10 @@ def test_the_newest_is_kept_at_most_twice_a_second(opened):
     assert kept(browser).scenario.warp == warps[-1]
 
 
-def test_edits_do_not_wait_for_a_browser_that_does_not_answer(opened, monkeypatch):
+def test_edits_do_not_wait_for_a_browser_that_does_not_answer(opened_for, monkeypatch):
     monkeypatch.setattr(keeping, "PATIENCE", PATIENCE)
     browser = Slow()
-    page = opened(browser)
+    page = opened_for(browser)
     wait_until(lambda: browser.asked == 2)
     for warp in np.linspace(0.9, 0.1, 20):
         page.session.edit("Warp", warp=float(warp))
@@ -171,8 +153,8 @@ def test_edits_do_not_wait_for_a_browser_that_does_not_answer(opened, monkeypatc
     assert kept(browser).scenario.warp == 0.1
 
 
-def test_a_visitor_who_leaves_is_not_waited_for(opened):
-    page = opened(Browser())
+def test_a_visitor_who_leaves_is_not_waited_for(opened_for):
+    page = opened_for(Browser())
     page.begin(MADE)
     wait_until(lambda: page.client.local_storage.told)
     began = time.monotonic()
@@ -181,9 +163,9 @@ def test_a_visitor_who_leaves_is_not_waited_for(opened):
     assert time.monotonic() - began < PAUSE / 2
 
 
-def test_a_reset_begins_anew_also_in_the_next_page(opened):
+def test_a_reset_begins_anew_also_in_the_next_page(opened_for):
     browser = Browser(**{KEY: made()})
-    page = opened(browser)
+    page = opened_for(browser)
     page.claim(page["History"], "Reset")
     settled(page)
     assert KEY not in browser and page.session.scenario.obstacles != MADE.obstacles
@@ -192,12 +174,12 @@ def test_a_reset_begins_anew_also_in_the_next_page(opened):
     assert kept(browser).scenario.warp == 0.5
     page.claim(page["History"], "Reset")
     settled(page)
-    assert opened(Browser(**browser)).session.scenario.task == "draw_s"
+    assert opened_for(Browser(**browser)).session.scenario.task == "draw_s"
 
 
-def test_a_reset_is_told_after_what_was_edited_before(opened):
+def test_a_reset_is_told_after_what_was_edited_before(opened_for):
     browser = Browser()
-    page = opened(browser)
+    page = opened_for(browser)
     for warp in (0.9, 0.8, 0.7):
         page.session.edit("Warp", warp=warp)
     page.give(page.commands["Reset the scene and the camera"])
@@ -216,30 +198,30 @@ FORGED = {
 
 
 @pytest.mark.parametrize("text", FORGED.values(), ids=FORGED)
-def test_what_makes_no_sense_is_forgotten_and_the_page_begins_anew_and_says_so_once(opened, text):
+def test_what_makes_no_sense_is_forgotten_and_the_page_begins_anew_and_says_so_once(opened_for, text):
     browser = Browser(**{KEY: text})
-    page = opened(browser)
+    page = opened_for(browser)
     assert page.session.scenario.task == "draw_s"
     assert message(page).startswith("The page begins anew. What this browser keeps: ")
     assert KEY not in browser
     page.begin(MADE)
     settled(page)
     assert kept(browser).scenario == MADE
-    assert message(opened(Browser(**browser))) == ""
+    assert message(opened_for(Browser(**browser))) == ""
 
 
-def test_a_browser_that_keeps_nothing_is_told_once_and_nothing_more_is_asked_of_it(opened):
+def test_a_browser_that_keeps_nothing_is_told_once_and_nothing_more_is_asked_of_it(opened_for):
     browser = Blocked()
-    page = opened(browser)
+    page = opened_for(browser)
     assert message(page) == keeping.BLOCKED
     page.begin(MADE)
     settled(page)
     assert browser.told == [] and page.session.scenario == MADE
 
 
-def test_a_browser_without_room_is_noticed_and_that_is_said_once(opened):
+def test_a_browser_without_room_is_noticed_and_that_is_said_once(opened_for):
     browser = Full(**{KEY: made()})
-    page = opened(browser)
+    page = opened_for(browser)
     said = []
     page.session.say = lambda text, severity: said.append(text)
     for warp in (0.5, 0.4):
@@ -254,9 +236,9 @@ def look_from_the_top(page: Page) -> None:
     page.visitor._camera.view("Top")
 
 
-def test_the_page_opens_before_a_slow_browser_has_told_and_goes_on_with_it_when_it_does(opened):
+def test_the_page_opens_before_a_slow_browser_has_told_and_goes_on_with_it_when_it_does(opened_for):
     browser = Slow(**{KEY: made()})
-    page = opened(browser)
+    page = opened_for(browser)
     assert page.session.scenario.task == "draw_s" and message(page) == keeping.SLOW
     look_from_the_top(page)
     assert browser.told == []
@@ -268,11 +250,11 @@ def test_the_page_opens_before_a_slow_browser_has_told_and_goes_on_with_it_when_
     assert {decode(text, KNOWN).scenario for _, text in browser.told} <= {MADE}
 
 
-def test_what_a_browser_keeps_is_not_overwritten_before_the_page_goes_on_with_it(opened, monkeypatch):
+def test_what_a_browser_keeps_is_not_overwritten_before_the_page_goes_on_with_it(opened_for, monkeypatch):
     ready, scene = threading.Event(), SCENES["lift"].scenario(TASKS["lift_box"]())
     monkeypatch.setattr(panel, "check_shapes", lambda _scenario: ready.wait(PATIENCE))
     browser = Browser(**{KEY: made(scenario=scene)})
-    page = opened(browser)
+    page = opened_for(browser)
     look_from_the_top(page)
     settled(page)
     assert page.session.scenario.task == "draw_s" and browser.told == []
@@ -283,9 +265,9 @@ def test_what_a_browser_keeps_is_not_overwritten_before_the_page_goes_on_with_it
     assert kept(browser).scenario == scene and kept(browser).camera is not None
 
 
-def test_a_slow_browser_that_keeps_nothing_is_told_where_the_camera_is_once_it_has_answered(opened):
+def test_a_slow_browser_that_keeps_nothing_is_told_where_the_camera_is_once_it_has_answered(opened_for):
     browser = Slow()
-    page = opened(browser)
+    page = opened_for(browser)
     browser.answers = True
     settled(page)
     look_from_the_top(page)
@@ -293,10 +275,10 @@ def test_a_slow_browser_that_keeps_nothing_is_told_where_the_camera_is_once_it_h
     assert kept(browser).camera is not None
 
 
-def test_a_browser_that_never_tells_is_given_up_and_told_of_edits_only(opened, monkeypatch):
+def test_a_browser_that_never_tells_is_given_up_and_told_of_edits_only(opened_for, monkeypatch):
     monkeypatch.setattr(keeping, "PATIENCE", 0.01)
     browser = Slow(**{KEY: made()})
-    page = opened(browser)
+    page = opened_for(browser)
     settled(page)
     assert browser.asked == 1 + keeping.ATTEMPTS
     look_from_the_top(page)
@@ -307,9 +289,9 @@ def test_a_browser_that_never_tells_is_given_up_and_told_of_edits_only(opened, m
     assert kept(browser).scenario.warp == 0.5
 
 
-def test_what_a_slow_browser_tells_while_a_task_is_chosen_or_after_a_reset_is_not_taken(opened):
+def test_what_a_slow_browser_tells_while_a_task_is_chosen_or_after_a_reset_is_not_taken(opened_for):
     browser, chosen = Slow(**{KEY: made()}), threading.Event()
-    page = opened(browser)
+    page = opened_for(browser)
 
     def choose(session: Any, _title: str) -> None:
         assert chosen.wait(PATIENCE)
@@ -322,7 +304,7 @@ def test_what_a_slow_browser_tells_while_a_task_is_chosen_or_after_a_reset_is_no
     settled(page)
     assert page.session.scenario.task == "draw_j" and kept(browser).scenario.task == "draw_j"
     browser = Slow(**{KEY: made()})
-    page = opened(browser)
+    page = opened_for(browser)
     page.claim(page["History"], "Reset")
     browser.answers = True
     settled(page)
@@ -330,9 +312,9 @@ def test_what_a_slow_browser_tells_while_a_task_is_chosen_or_after_a_reset_is_no
     assert page.session.scenario.task == "draw_s" and KEY not in browser
 
 
-def test_what_a_slow_browser_tells_after_an_edit_is_not_taken(opened):
+def test_what_a_slow_browser_tells_after_an_edit_is_not_taken(opened_for):
     browser = Slow(**{KEY: made()})
-    page = opened(browser)
+    page = opened_for(browser)
     page.session.edit("Warp", warp=0.5)
     mine = page.session.scenario
     browser.answers = True
@@ -341,9 +323,9 @@ def test_what_a_slow_browser_tells_after_an_edit_is_not_taken(opened):
     assert page.session.scenario == mine and kept(browser).scenario == mine
 
 
-def test_two_pages_of_one_browser_keep_the_last_edit_and_complain_of_nothing(opened, robot, another):
+def test_two_pages_of_one_browser_keep_the_last_edit_and_complain_of_nothing(opened_for, robot, another):
     browser = Browser()
-    one, other = opened(browser), Page(another, robot, kept=browser)
+    one, other = opened_for(browser), Page(another, robot, kept=browser)
     for page, warp in ((one, 0.9), (other, 0.8), (one, 0.7), (other, 0.6)):
         page.session.edit("Warp", warp=warp)
         settled(page)
@@ -352,28 +334,28 @@ def test_two_pages_of_one_browser_keep_the_last_edit_and_complain_of_nothing(ope
     other.close()
 
 
-def test_shapes_from_files_are_kept_and_come_back_beside_the_event_loop(opened):
+def test_shapes_from_files_are_kept_and_come_back_beside_the_event_loop(opened_for):
     browser, box = Browser(), MeshObstacle(PLACE, Solid(*box_surface(np.full(3, 0.05))))
-    page = opened(browser)
+    page = opened_for(browser)
     page.begin(changed(MADE, obstacles=(box, Sphere(PLACE))))
     settled(page)
     assert message(page) == "" and kept(browser).scenario.obstacles == (box, Sphere(PLACE))
-    again = opened(Browser(**browser))
+    again = opened_for(Browser(**browser))
     assert again.session.jobs.wait_idle(CHOICES, PATIENCE)
     assert again.session.scenario == page.session.scenario
 
 
-def test_a_broken_shape_that_is_kept_is_said_and_the_page_begins_anew(opened):
+def test_a_broken_shape_that_is_kept_is_said_and_the_page_begins_anew(opened_for):
     vertices, faces = box_surface(np.full(3, 0.05))
     text = made(scenario=changed(MADE, obstacles=(MeshObstacle(PLACE, Solid(vertices, faces[:4])),)))
-    page = opened(Browser(**{KEY: text}))
+    page = opened_for(Browser(**{KEY: text}))
     assert page.session.jobs.wait_idle(CHOICES, PATIENCE)
     assert "mesh: found" in message(page) and page.session.scenario.task == "draw_s"
 
 
-def test_what_is_not_kept_is_said_once_and_all_else_is_kept(opened, monkeypatch):
+def test_what_is_not_kept_is_said_once_and_all_else_is_kept(opened_for, monkeypatch):
     browser = Browser()
-    page = opened(browser)
+    page = opened_for(browser)
     monkeypatch.setattr(keeping, "MAX_KEPT", len(made()) + 200)
     said = []
     page.session.say = lambda text, severity: said.append(text)
@@ -386,9 +368,9 @@ def test_what_is_not_kept_is_said_once_and_all_else_is_kept(opened, monkeypatch)
     assert kept(browser).scenario == replace(changed(MADE, obstacles=(ball,)), warp=0.5)
 
 
-def own_page(opened: Any, browser: Browser) -> Page:
+def own_page(opened_for: Any, browser: Browser) -> Page:
     """A page on which a task of the visitor's own is shown."""
-    page = opened(browser)
+    page = opened_for(browser)
     own, _ = page.session.bring(own_task(TASKS["draw_s"]().demonstrations).placed(0.8, (0.1, 0.0, 1 / 3)))
     page.visitor._panel._titles[own.name] = own.title
     page.session.choose_task(own.name)
@@ -396,10 +378,10 @@ def own_page(opened: Any, browser: Browser) -> Page:
     return page
 
 
-def test_a_task_of_own_demonstrations_is_kept_with_them_and_comes_back(opened):
+def test_a_task_of_own_demonstrations_is_kept_with_them_and_comes_back(opened_for):
     browser = Browser()
-    page = own_page(opened, browser)
-    again = opened(Browser(**browser))
+    page = own_page(opened_for, browser)
+    again = opened_for(Browser(**browser))
     assert again.session.jobs.wait_idle(CHOICES, PATIENCE)
     settled(again)
     before, after = page.session.task, again.session.task
@@ -409,10 +391,10 @@ def test_a_task_of_own_demonstrations_is_kept_with_them_and_comes_back(opened):
     assert kept(again.client.local_storage).own is not None
 
 
-def test_a_task_of_large_demonstrations_leaves_what_was_kept_before(opened, monkeypatch):
+def test_a_task_of_large_demonstrations_leaves_what_was_kept_before(opened_for, monkeypatch):
     monkeypatch.setattr(keeping, "MAX_KEPT", 5000)
     browser = Browser(**{KEY: made()})
-    page = opened(browser)
+    page = opened_for(browser)
     own, _ = page.session.bring(replace(TASKS["draw_s"](), name=""))
     page.visitor._panel._titles[own.name] = own.title
     page.session.choose_task(own.name)
@@ -423,8 +405,8 @@ def test_a_task_of_large_demonstrations_leaves_what_was_kept_before(opened, monk
     assert kept(browser).scenario.task == "draw_j"
 
 
-def test_a_link_begins_its_task_afresh_also_where_that_is_what_was_kept_and_undo_brings_it_back(opened):
-    page = opened(Browser(**{KEY: made()}))
+def test_a_link_begins_its_task_afresh_also_where_that_is_what_was_kept_and_undo_brings_it_back(opened_for):
+    page = opened_for(Browser(**{KEY: made()}))
     page.visitor.told(Link("task", MADE.task))
     assert page.session.jobs.wait_idle(CHOICES, PATIENCE)
     assert page.session.scenario == initial_scenario(page.session.engine, MADE.task)
@@ -453,9 +435,9 @@ def assert_is_at(camera: Any, pose: Any) -> None:
     np.testing.assert_allclose(camera, pose)
 
 
-def test_a_camera_that_is_moved_is_kept_and_one_that_is_not_is_none(opened):
+def test_a_camera_that_is_moved_is_kept_and_one_that_is_not_is_none(opened_for):
     browser = Browser()
-    page = opened(browser)
+    page = opened_for(browser)
     page.visitor._camera.look(TASKS["draw_s"]())
     page.session.edit("Warp", warp=0.5)
     settled(page)
@@ -469,8 +451,8 @@ def test_a_camera_that_is_moved_is_kept_and_one_that_is_not_is_none(opened):
     assert kept(browser).camera is None
 
 
-def test_the_camera_begins_where_it_was_and_goes_its_own_way_afterwards(opened):
-    page = opened(Browser(**{KEY: made(SIGHT)}))
+def test_the_camera_begins_where_it_was_and_goes_its_own_way_afterwards(opened_for):
+    page = opened_for(Browser(**{KEY: made(SIGHT)}))
     seen = []
     for scenario, stage in ((MADE, Stage.ROLLOUTS), (MADE, Stage.LIVE), (MADE, Stage.LIVE)):
         drawn(page, scenario, stage)
@@ -479,7 +461,7 @@ def test_the_camera_begins_where_it_was_and_goes_its_own_way_afterwards(opened):
     assert seen[2] != SIGHT
 
 
-def test_the_camera_of_another_task_is_not_taken(opened):
-    page = opened(Browser(**{KEY: made(SIGHT)}))
+def test_the_camera_of_another_task_is_not_taken(opened_for):
+    page = opened_for(Browser(**{KEY: made(SIGHT)}))
     drawn(page, Scenario("draw_s"), Stage.LIVE)
     assert tuple(page.camera.position) != SIGHT[0]

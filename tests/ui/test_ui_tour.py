@@ -1,5 +1,6 @@
 """The tour on the page, without a browser: what it shows, what it remembers, and what it gives back."""
 
+import threading
 from functools import partial
 
 import pytest
@@ -23,22 +24,15 @@ MADE = changed(Scenario("draw_c", starts=starts_at(PLACE)), obstacles=(Box(PLACE
 
 
 @pytest.fixture
-def opened(server, robot):
-    """Opens the page for what a browser keeps."""
-    pages = []
+def opened(opened_for):
+    """Opens the page for what a browser keeps, and waits until it has asked for that."""
 
     def opens(**kept: str) -> Page:
-        server.gui.reset()
-        server.scene.reset()
-        pages.append(Page(server, robot, kept=Kept(kept)))
-        settled(pages[-1])
-        return pages[-1]
+        page = opened_for(Kept(kept))
+        settled(page)
+        return page
 
-    yield opens
-    for page in pages:
-        page.close()
-    server.gui.reset()
-    server.scene.reset()
+    return opens
 
 
 def settled(page: Page) -> None:
@@ -146,6 +140,25 @@ def test_after_a_reload_the_same_step_is_shown_and_the_end_gives_back_what_was_m
     press(page, "Step", END)
     assert page.session.scenario == MADE
     assert decode(page.client.local_storage[MADE_KEY], Known(tuple(TITLES))).scenario == MADE
+
+
+def test_it_begins_once_a_slow_browser_has_told_what_was_made(opened_for, monkeypatch):
+    """Otherwise the step would be taken for an edit, and what was made be lost."""
+    told = threading.Event()
+
+    class Slow(Kept):
+        def get_item(self, key, timeout=None):
+            if key == MADE_KEY and not told.wait(timeout):
+                raise TimeoutError
+            return super().get_item(key)
+
+    page = opened_for(Slow({MADE_KEY: encode(Saved(MADE)), KEY: "4"}))
+    assert not told.wait(0.3) and number(page) is None
+    told.set()
+    settled(page)
+    assert is_step(page, 3)
+    press(page, "Step", END)
+    assert page.session.scenario == MADE
 
 
 def test_the_warp_grows_once_by_itself_where_its_slider_is_beside_the_text(opened, monkeypatch):
