@@ -1,6 +1,7 @@
 """The tour on the page, without a browser: what it shows, what it remembers, and what it gives back."""
 
 import threading
+import time
 from functools import partial
 
 import pytest
@@ -142,7 +143,7 @@ def test_after_a_reload_the_same_step_is_shown_and_the_end_gives_back_what_was_m
     assert decode(page.client.local_storage[MADE_KEY], Known(tuple(TITLES))).scenario == MADE
 
 
-def test_it_begins_once_a_slow_browser_has_told_what_was_made(opened_for, monkeypatch):
+def test_it_begins_once_a_slow_browser_has_told_what_was_made(opened_for):
     """Otherwise the step would be taken for an edit, and what was made be lost."""
     told = threading.Event()
 
@@ -154,6 +155,9 @@ def test_it_begins_once_a_slow_browser_has_told_what_was_made(opened_for, monkey
 
     page = opened_for(Slow({MADE_KEY: encode(Saved(MADE)), KEY: "4"}))
     assert not told.wait(0.3) and number(page) is None
+    panel = page.visitor._panel
+    choose = panel.choose
+    panel.choose = lambda begin, *others: choose(lambda *args: (time.sleep(0.3), begin(*args)), *others)
     told.set()
     settled(page)
     assert is_step(page, 3)

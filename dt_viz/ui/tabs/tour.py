@@ -10,7 +10,7 @@ import viser
 
 from dt_viz.scenario.tour import STEPS, TASK, TourStep
 from dt_viz.session import player
-from dt_viz.session.session import Session
+from dt_viz.session.session import CHOICES, Session
 from dt_viz.ui import keeping
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.keeping import Storage
@@ -145,6 +145,7 @@ class Tour:
     def _enter(self, session: Session, number: int) -> None:
         """Begin once the page goes on with what the browser keeps: what begins before takes its place."""
         session.jobs.wait_idle(keeping.LANE)
+        session.jobs.wait_idle(CHOICES)
         self._go(session, number)
 
     def _go(self, session: Session, number: int) -> None:
