@@ -33,6 +33,10 @@ class Pace:
     """Edits that were computed or overtaken since then."""
 
 
+READ = 30.0
+"""Time that a message is shown, seconds: enough to look up from the scene, and read it twice."""
+
+
 @dataclass(frozen=True)
 class Message:
     """A text for the visitor; it is of interest until another scenario is shown, for a while."""
@@ -41,6 +45,8 @@ class Message:
     severity: Severity
     scenario: Scenario
     """The scenario that was wanted when it came."""
+    came: float = 0.0
+    """When that was, seconds, of `time.monotonic`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,17 +136,17 @@ class Screen:
             self.progress = replace(self.progress, **changes)
             self._display.tell(self.progress)
 
-    def say(self, text: str, severity: Severity, wanted: Scenario) -> Message:
-        """Show a message while a scenario is wanted; return it."""
-        message = Message(text, severity, wanted)
-        self.tell(message=message)
-        return message
+    def say(self, text: str, severity: Severity, wanted: Scenario) -> None:
+        """Show a message while a scenario is wanted."""
+        self.tell(message=Message(text, severity, wanted, time.monotonic()))
 
-    def forget(self, message: Message) -> None:
-        """Show a message no longer, unless it tells what has failed: then nothing else would."""
-        with self._telling:
-            if self.progress.message is message and not self.progress.failed:
-                self.tell(message=None)
+    def let_pass(self, now: float) -> None:
+        """Show a message no longer that came `READ` before now, seconds; what tells of a failure stays."""
+        if self.progress.message is not None:
+            with self._telling:
+                message = self.progress.message
+                if message is not None and now - message.came >= READ and not self.progress.failed:
+                    self.tell(message=None)
 
     def draw(self, frame: Frame, edited: float, num_skipped: int, num_edits: int) -> None:
         """Show a frame whose scenario was asked for at a time, of `time.perf_counter`; learning is no rebuild."""

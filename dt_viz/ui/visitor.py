@@ -267,6 +267,7 @@ class Visitor(Display):
         with self._exchanging:
             self.robot.pose(now, self.pictures.look.tubes)
             self._panel.pose(self.robot.playback)
+        self.session.let_pass()
 
     def _exchange(self, name: str) -> None:
         """Draw the arm of a name in place of the one that is drawn."""

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any, cast
 
 import pytest
-from pages import Edited, frame_of, panel_of
+from pages import Edited, frame_of, panel_of, wait_until
 from scenes import avoiding, beside, biases, changed
 
 from dt_viz.avoidance.bias import BiasPoint
@@ -485,3 +485,10 @@ def test_choosing_a_task_keeps_nobody_waiting_and_says_at_once_what_is_done(pane
     assert (COMPUTING not in panel.status.line.content) == settles
     assert ((panel.status.details.content, panel.hint.content) == settled) == settles
     assert ("push.csv" in panel.status.line.content) == (chosen == "push_box")
+
+
+def test_a_message_passes_on_a_page_that_nobody_touches(page, monkeypatch):
+    page.session.say("places left out", Severity.WARNING)
+    assert "places left out" in page.visitor._panel.status.line.content
+    monkeypatch.setattr("dt_viz.session.progress.READ", 0.0)
+    wait_until(lambda: "places left out" not in page.visitor._panel.status.line.content)
