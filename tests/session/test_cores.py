@@ -191,22 +191,22 @@ def test_what_is_computed_in_a_slot_is_charged(crowd):
 
 
 @pytest.mark.parametrize("account", [None, owing(5.0)], ids=["in credit", "overdrawn"])
-def test_between_parts_who_has_overdrawn_gives_way_while_a_hand_is_followed(account):
-    for followed in (True, False):
-        gives_way = followed and account is not None
-        cores, went_on = Cores(2, CoresSettings(longest=0.5 if gives_way else 10 * PATIENCE)), threading.Event()
+@pytest.mark.parametrize("followed", [True, False])
+def test_between_parts_who_has_overdrawn_gives_way_while_a_hand_is_followed(account, followed):
+    gives_way = followed and account is not None
+    cores, went_on = Cores(2, CoresSettings(longest=0.5 if gives_way else 10 * PATIENCE)), threading.Event()
 
-        def compute(cores=cores, went_on=went_on):
-            with charged(account), cores.slot(Rank.REFINEMENT):
-                assert not cores.giving_way(never)()
-                went_on.set()
+    def compute():
+        with charged(account), cores.slot(Rank.REFINEMENT):
+            assert not cores.giving_way(never)()
+            went_on.set()
 
-        thread, began = threading.Thread(target=compute), monotonic()
-        with cores.slot() if followed else nullcontext():
-            thread.start()
-            assert went_on.wait(PATIENCE)  # not for ever
-            assert not gives_way or monotonic() - began >= 0.5
-        thread.join(PATIENCE)
+    thread, began = threading.Thread(target=compute), monotonic()
+    with cores.slot() if followed else nullcontext():
+        thread.start()
+        assert went_on.wait(PATIENCE)  # not for ever
+        assert not gives_way or monotonic() - began >= 0.5
+    thread.join(PATIENCE)
 
 
 def test_who_has_overdrawn_goes_on_as_soon_as_no_hand_is_followed():
