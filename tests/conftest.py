@@ -4,6 +4,7 @@ import atexit
 import os
 import shutil
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 
 # Tests run beside each other, each on one core: read when numpy is imported, by its BLAS.
@@ -19,8 +20,11 @@ OWN_FOLDER = Path(tempfile.mkdtemp(prefix="dt-viz-tests-", dir=os.environ.get("P
 atexit.register(shutil.rmtree, OWN_FOLDER, ignore_errors=True)
 tempfile.tempdir = os.environ["TMPDIR"] = str(OWN_FOLDER / "tmp")
 os.environ["XDG_CACHE_HOME"] = str(OWN_FOLDER / "cache")
-for folder in (tempfile.tempdir, os.environ["XDG_CACHE_HOME"] + "/dt-viz"):
-    Path(folder).mkdir(parents=True)
+# Arms are made once for a whole run: workers are given the folder of the process that starts them.
+ARMS = Path(os.environ.setdefault("DT_VIZ_TEST_ARMS", str(OWN_FOLDER / "arms")))
+for folder in (tempfile.tempdir, ARMS, os.environ["XDG_CACHE_HOME"] + "/dt-viz"):
+    Path(folder).mkdir(parents=True, exist_ok=True)
+Path(os.environ["XDG_CACHE_HOME"], "dt-viz/arms").symlink_to(ARMS)
 
 import leftovers
 import pytest
@@ -79,7 +83,11 @@ def cache(tmp_path_factory, request) -> Path:
     processes of their own, share it."""
     is_worker = hasattr(request.config, "workerinput")
     folder = tmp_path_factory.getbasetemp()
-    return (folder.parent if is_worker else folder) / "cache"
+    cache = (folder.parent if is_worker else folder) / "cache"
+    (cache / "dt-viz").mkdir(parents=True, exist_ok=True)
+    with suppress(FileExistsError):  # another worker was first
+        (cache / "dt-viz/arms").symlink_to(ARMS)
+    return cache
 
 
 @pytest.fixture(scope="session")

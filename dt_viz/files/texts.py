@@ -61,18 +61,19 @@ def decoded(
     arrays = parts.pop("arrays", b"{}")
     check_at_most("text", sum(map(len, parts.values())), max_plain, "bytes beside its arrays")
     plain = {name: msgspec.json.decode(part) for name, part in parts.items()}
-    held = msgspec.json.decode(arrays, type=dict[str, _Array])
+    held = msgspec.json.decode(arrays, type=dict[str, msgspec.Raw])
     check_at_most("arrays", len(held), MAX_ARRAYS)
     return plain, {name: _array(name, array) for name, array in held.items()}
 
 
-def _array(name: str, held: _Array) -> np.ndarray:
+def _array(name: str, raw: msgspec.Raw) -> np.ndarray:
+    held = msgspec.json.decode(raw, type=_Array)
     if (
         len(held.shape) > MAX_DIMENSIONS
         or min(held.shape, default=0) < 0
         or math.prod(held.shape) * 8 != len(held.data)
     ):
-        found = f"shape {str(held.shape)[:40]} for {len(held.data)} bytes"
+        found = f"shape {str(held.shape[:20])[:40]} for {len(held.data)} bytes"
         raise FormatError(f"array {name[:80]!r}", found, "a shape of one or two axes, and 8 bytes for each value")
     values = np.frombuffer(held.data, np.dtype(held.type).newbyteorder("<"))
     return values.astype(held.type, copy=False).reshape(held.shape)

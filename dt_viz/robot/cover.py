@@ -24,6 +24,7 @@ from scipy.spatial import KDTree
 
 from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.kernels.arm import BODY_POINT
+from dt_viz.kernels.bounding import step_to_the_farthest
 from dt_viz.obstacles.triangles import grid_nodes, inside_of_grid, surface_samples
 from dt_viz.robot.meshes import LinkMesh, cells
 
@@ -282,16 +283,9 @@ def _clusterings(
 
 def bounding_sphere(spheres: Spheres) -> Array:
     """Find the smallest sphere (4,) around others, about: its centre steps to the farthest (Bădoiu and Clarkson)."""
-    centres, radii = np.array(spheres[:, :3]), spheres[:, 3]
     centre = spheres[:, :3].mean(axis=0)
-    for step in range(2, 100):
-        away = centres - centre
-        apart = np.sqrt(np.add.reduce(away * away, axis=1))
-        farthest = (apart + radii).argmax()
-        length = apart[farthest]
-        if length:
-            centre = centre + away[farthest] * (1 + radii[farthest] / length) / step
-    return np.append(centre, (np.linalg.norm(centres - centre, axis=1) + radii).max())
+    step_to_the_farthest(centre, np.ascontiguousarray(spheres), 98)
+    return np.append(centre, (np.linalg.norm(spheres[:, :3] - centre, axis=1) + spheres[:, 3]).max())
 
 
 def _tree(spheres: Spheres, num_leaves: int) -> tuple[Spheres, Indices]:

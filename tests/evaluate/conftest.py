@@ -13,7 +13,6 @@ from tests.benchmarks.__main__ import main as benchmarks
 
 @pytest.fixture(scope="module", autouse=True)
 def fits_of_the_tests(cache):
-    (cache / "dt-viz").mkdir(parents=True, exist_ok=True)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(cache))
         yield

@@ -46,7 +46,6 @@ each_arm = pytest.mark.parametrize("name", OTHERS)
 @pytest.fixture(scope="module", autouse=True)
 def _arms_of_the_tests(cache):
     """Arms are made once for the whole test run."""
-    (cache / "dt-viz").mkdir(parents=True, exist_ok=True)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(cache))
         yield

@@ -180,7 +180,7 @@ def test_places_out_of_reach_are_red_and_the_take_is_scaled_if_that_is_wanted(ro
 
 
 def test_a_board_is_in_the_reach_of_other_arms(robot):
-    for arm in (robot, load_arm("so101")):
+    for arm in (robot, load_arm("so100")):
         assert not out_of_reach(arm, board_of(arm).at(curve(np.linspace(0, 1, 50)) * arm.size)).any()
 
 

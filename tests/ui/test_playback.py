@@ -136,7 +136,7 @@ def test_the_longer_a_picture_takes_the_fewer_there_are():
         if len(begun) > 5:
             enough.set()
 
-    settings = PlaybackSettings(shortest=1e-3)
+    settings = PlaybackSettings(shortest=1e-3, longest=PATIENCE)
     _, jobs = playback_of(Arm(), draw, settings=settings)
     assert enough.wait(PATIENCE)
     jobs.close()

@@ -104,13 +104,16 @@ class Timeline:
         if player is None:
             self.panel.visible = False
             return
-        self._source.value = PAST if player is playback.past else REPLAY
         self._buttons.options = (BACK, PAUSE if player.playing else PLAY, ON)
         self._moment.handle.max = max(0.01, math.ceil(100 * player.duration) / 100)
-        moment = round(player.moment, 2)
-        if moment != self._moment.value:  # what a visitor moves it to meanwhile is not put back while nothing plays
-            self._moment.value = moment
-        self._loops.value, self._speed.value = player.loops, player.speed
+        for control, value in (
+            (self._source, PAST if player is playback.past else REPLAY),
+            (self._moment, round(player.moment, 2)),
+            (self._loops, player.loops),
+            (self._speed, player.speed),
+        ):
+            if value != control.value:  # what a visitor changes at this instant is not put back
+                control.value = value
         if not self.panel.visible:
             self.panel.visible = True
             self.panel.expand()  # on a phone it is folded at first
