@@ -1,4 +1,4 @@
-"""A picture of a scene without a page: PNG, MP4 or GIF by an installed Chromium, SVG or PDF, or an HTML page that plays.
+"""A picture of a scene without a page: PNG, MP4 or GIF by an installed Chromium, SVG, PDF, or an HTML page that plays.
 
 dt-viz picture fig-4 --out fig4.png --size 3840x2160
 dt-viz picture draw_s --out s.svg
