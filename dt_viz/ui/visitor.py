@@ -357,8 +357,11 @@ class Visitor(Display):
             UnwantedError: it is cancelled.
         """
         check_installed()
+        deadline = time.monotonic() + SETTINGS.patience
         while not self.session.wait_idle(SETTINGS.look):
             step(0.0)
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"the scene was not at rest within {SETTINGS.patience:g} s")
         scenario = self.session.scenario
 
         def ended() -> bool:

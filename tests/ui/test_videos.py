@@ -12,6 +12,7 @@ from pages import NoFrames, Page, all_of, wait_until
 
 from dt_viz.obstacles.shapes import rotation
 from dt_viz.session.frame import Stage
+from dt_viz.session.progress import Pace
 from dt_viz.ui.scene.camera import TURN, shot_of
 from dt_viz.ui.scene.film import MOTION, TURNTABLE, WARP, FilmSettings
 from dt_viz.ui.scene.palette import DARK, LIGHT
@@ -200,12 +201,18 @@ def test_it_is_cancelled_at_once_though_the_browser_is_busy(filming, what):
     browser.goes_on.set()
 
 
-def test_an_edit_ends_it_and_is_shown(filming):
-    browser = filming.browser
+def test_an_edit_ends_it_and_is_shown(filming, frame):
+    browser, visitor, edited = filming.browser, filming.visitor, replace(frame, stage=Stage.FINE)
     browser.goes_on.clear()
     begin(filming, MOTION)
     assert browser.waits.wait(30)
+    drawing = threading.Thread(target=visitor.draw, args=(edited, Pace(0.02, 10.0, 0)))
+    drawing.start()
+    drawing.join(0.5)
+    assert drawing.is_alive() and visitor.pictures._frame is frame  # it waits
     filming.session.step("test", warp=0.5)
+    drawing.join(10)
+    assert visitor.pictures._frame is edited is visitor.shown
     assert filming.session.jobs.wait_idle("Save picture", 10)
     message = filming.session._screen.progress.message.text
     assert message.startswith("Save video: the scene: found an edit while it was filmed") and not filming.sent
@@ -246,7 +253,7 @@ def test_what_goes_wrong_is_said_in_a_line_and_nothing_stays(filming, frame, why
         for module in ("visitor", "scene.film"):
             monkeypatch.setattr(f"dt_viz.ui.{module}.SETTINGS", short)
         browser.goes_on.clear()
-        said = "Save video: the browser drew no frame; keep the page in sight within 0.3 s"
+        said = "Save video: the browser, its page out of sight perhaps, drew no frame within 0.3 s"
     elif why == "another size":
         browser.size = 8, 8
         said = "Save video: the browser: found a picture of shape (8, 8, 4); accepted: 1280x720 pixels"

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
-from time import monotonic
+from functools import partial
+from time import monotonic, thread_time
 from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dt_viz.accounts import settle
 from dt_viz.errors import Cancelled, end_if
 from dt_viz.flows.fields import Array
 from dt_viz.pictures.video import Encoder
@@ -133,22 +135,31 @@ def encoded(
     pool = ThreadPoolExecutor(1, "film")
 
     def done(work: Callable[[], _Result], failed: str) -> _Result:
-        return _waited(pool.submit(work), failed, cancelled)
+        result, seconds = _waited(pool.submit(_timed, work), failed, cancelled)
+        settle(seconds)
+        return result
 
     try:
         with Encoder(suffix, size, SETTINGS.rate) as encoder:
             frame = np.zeros((size[1], size[0], 3), np.uint8)
             for k, part in enumerate(film.parts.tolist()):
                 end_if(cancelled)
-                rendering = film.show(part)
-                frame = done(lambda: render(rendering), "the browser drew no frame; keep the page in sight")  # noqa: B023
-                done(lambda: encoder.write(frame), "ffmpeg took no frame")  # noqa: B023
+                frame = done(
+                    partial(render, film.show(part)), "the browser, its page out of sight perhaps, drew no frame"
+                )
+                done(partial(encoder.write, frame), "ffmpeg took no frame")
                 step((k + 1) / (len(film.parts) + 1))
             for _ in range(round(SETTINGS.rest * SETTINGS.rate) if film.rests else 0):
-                done(lambda: encoder.write(frame), "ffmpeg took no frame")
+                done(partial(encoder.write, frame), "ffmpeg took no frame")
             return done(encoder.finish, "ffmpeg wrote no file")
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _timed(work: Callable[[], _Result]) -> tuple[_Result, float]:
+    """Return what work returns, and the processor time that it takes, seconds."""
+    began = thread_time()
+    return work(), thread_time() - began
 
 
 def _waited(future: Future[_Result], failed: str, cancelled: Cancelled) -> _Result:
