@@ -237,6 +237,7 @@ def test_what_moves_waits_and_the_theme_that_is_chosen_comes_afterwards(filming,
     assert visitor.robot.playback.replay.clock == clock and np.array_equal(filming.camera.position, place)
     browser.goes_on.set()
     assert filming.session.jobs.wait_idle("Save picture", 60)
+    wait_until(lambda: not np.array_equal(filming.camera.position, place))
     turned = np.linalg.norm(filming.camera.position - place) / np.linalg.norm(place - filming.camera.look_at)
     assert turned < 0.5 * TURN  # it goes on from where it was
     assert visitor.pictures._theme is DARK
