@@ -47,6 +47,16 @@ class Camera:
         return np.array([frame.wxyz for frame in arms]), handles
 
 
+class Filmed(Page):
+    """A page whose videos are rendered by a camera, and kept in a file."""
+
+    def __init__(self, server, robot, file):
+        super().__init__(server, robot)
+        self.sent, self.browser, self.file = [], Camera(self), file
+        self.client.send_file_download = lambda name, content, **_how: self.sent.append((name, content))
+        self.client.get_render = self.browser.get_render
+
+
 @pytest.fixture(scope="module")
 def frame(at_rest, initial):
     return at_rest(initial("draw_s"), Stage.CERTIFIED)
@@ -59,7 +69,7 @@ def filming(server, robot, frame, engine, monkeypatch, tmp_path):
         monkeypatch.setattr(f"dt_viz.ui.{module}.SETTINGS", SHORT)
     fine = lambda _self, scenario, cancelled: engine.fine(scenario, cancelled)  # noqa: E731
     monkeypatch.setattr(NoFrames, "fine", fine, raising=False)
-    page = Page(server, robot)
+    page = Filmed(server, robot, tmp_path / "video")
     view = replace(frame.scenario.view, replay=True, handles=True)
     page.session.edit("test", **all_of(replace(frame.scenario, view=view)))
     visitor = page.visitor
@@ -70,9 +80,6 @@ def filming(server, robot, frame, engine, monkeypatch, tmp_path):
     player = visitor.robot.playback.replay
     player.seek(0.3 * player.duration)
     page.camera.wxyz = shot_of((page.camera.position, page.camera.look_at)).wxyz
-    page.sent, page.browser, page.file = [], Camera(page), tmp_path / "video"
-    page.client.send_file_download = lambda name, content, **_how: page.sent.append((name, content))
-    page.client.get_render = page.browser.get_render
     shown = robot.joint_frames(player.q)
     wait_until(lambda: np.allclose(page.browser.look()[0], shown, atol=0.01))
     yield page
