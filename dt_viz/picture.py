@@ -1,9 +1,10 @@
-"""A picture of a scene without a page: a PNG by an installed Chromium, an SVG or a PDF, or an HTML page that plays it.
+"""A picture of a scene without a page: PNG, MP4 or GIF by an installed Chromium, SVG, PDF, or an HTML page that plays.
 
 dt-viz picture fig-4 --out fig4.png --size 3840x2160
 dt-viz picture draw_s --out s.svg
 dt-viz picture fig-4 --out fig4.html
 dt-viz picture tour-2 --out warp.png
+dt-viz picture lift --out lift.mp4 --of turntable
 """
 
 from __future__ import annotations
@@ -47,6 +48,8 @@ class PictureSettings:
     """Smallest width and height, pixels."""
     largest: int = 7680
     """Largest width and height, pixels."""
+    largest_video: int = 1920
+    """Largest width and height of a video, pixels."""
     window: int = 1920
     """Largest width and height of the browser's window, pixels: the picture may be larger."""
     patience: float = 300.0
@@ -58,14 +61,19 @@ class PictureSettings:
 
 
 SETTINGS = PictureSettings()
+OF = ("motion", "turntable", "warp")
+"""What a video shows."""
 
 
 def main(arguments: Sequence[str], prog: str) -> int:
     """Make a picture; returns the process' exit status, or raises SystemExit where argparse does."""
     parser = argparse.ArgumentParser(prog=prog, description=(__doc__ or "").splitlines()[0])
     parser.add_argument("scene", metavar="SCENE", help="a scene, such as fig-4 or its name, a task, or tour-1 to 6")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="a .png, .svg, .pdf or .html")
-    parser.add_argument("--size", default="1920x1080", metavar="WxH", help="pixels of a PNG (default: %(default)s)")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="FILE", help="a .png, .svg, .pdf, .html, .mp4 or .gif"
+    )
+    parser.add_argument("--size", metavar="WxH", help="pixels of a PNG (default: 1920x1080) or a video (1280x720)")
+    parser.add_argument("--of", choices=OF, default=OF[0], help="what a video shows (default: %(default)s)")
     options = parser.parse_args(arguments)
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -76,7 +84,7 @@ def main(arguments: Sequence[str], prog: str) -> int:
 
     logging.basicConfig(level=logging.CRITICAL)  # what a browser that is closed leaves unsaid is no matter
     try:
-        make = _maker(options.out, options.size)
+        make = _maker(options.out, options.size, options.of)
         task, scenario = _chosen(options.scene)
         write_whole(options.out, make(task, scenario))
     except (DataError, FormatError, ImitationError, OSError, TimeoutError) as error:
@@ -86,33 +94,38 @@ def main(arguments: Sequence[str], prog: str) -> int:
     return 0
 
 
-def _maker(out: Path, size: str) -> Callable[[str, Callable[[Task], Scenario]], bytes]:
+def _maker(out: Path, size: str | None, of: str) -> Callable[[str, Callable[[Task], Scenario]], bytes]:
     """Return what makes a file of this kind; raises FormatError before anything is computed where nothing can."""
     from dt_viz.errors import FormatError  # noqa: PLC0415
-    from dt_viz.pictures.figures import check_installed  # noqa: PLC0415
+    from dt_viz.pictures import figures, video  # noqa: PLC0415
     from dt_viz.ui.scene.figure import SUFFIXES  # noqa: PLC0415
 
-    suffixes = ".png", *SUFFIXES, ".html"
+    suffixes = ".png", *SUFFIXES, ".html", *video.VIDEO_SUFFIXES
     if out.suffix not in suffixes:
         raise FormatError("--out", repr(str(out)), f"a file that ends in {', '.join(suffixes)}")
     if not out.absolute().parent.is_dir() or out.is_dir():
         raise FormatError("--out", repr(str(out)), "a file in a folder that exists")
     if out.suffix in SUFFIXES:
-        check_installed()
+        figures.check_installed()
         return lambda task, scenario: _drawn(task, scenario, out.suffix)
     if out.suffix == ".html":
         return _recorded
+    is_video = out.suffix in video.VIDEO_SUFFIXES
+    size = size or ("1280x720" if is_video else "1920x1080")
     found = re.fullmatch(r"(\d{1,9})x(\d{1,9})", size)
-    pixels = tuple(int(number) for number in found.groups()) if found else (0, 0)
-    if not SETTINGS.smallest <= min(pixels) <= max(pixels) <= SETTINGS.largest:
-        accepted = f"WIDTHxHEIGHT, each {SETTINGS.smallest} to {SETTINGS.largest}"
-        raise FormatError("--size", repr(size), accepted)
+    width, height = (int(number) for number in found.groups()) if found else (0, 0)
+    largest, even = (SETTINGS.largest_video, "even, ") if is_video else (SETTINGS.largest, "")
+    odd = is_video and (width % 2 or height % 2)
+    if odd or not SETTINGS.smallest <= min(width, height) <= max(width, height) <= largest:
+        raise FormatError("--size", repr(size), f"WIDTHxHEIGHT, each {even}{SETTINGS.smallest} to {largest}")
+    if is_video:
+        video.check_installed()
     given = os.environ.get(SETTINGS.variable)
     browser = next(filter(None, map(shutil.which, (given,) if given else SETTINGS.browsers)), None)
     if browser is None:
         accepted = f"one of {', '.join(SETTINGS.browsers)}, or its path in {SETTINGS.variable} (or --out with .svg)"
         raise FormatError("Chromium", repr(given) if given else "none installed", accepted)
-    return lambda task, scenario: _rendered(task, scenario, (pixels[0], pixels[1]), browser)
+    return lambda task, scenario: _rendered(task, scenario, (width, height), browser, out.suffix, of)
 
 
 def _chosen(name: str) -> tuple[str, Callable[[Task], Scenario]]:
@@ -167,14 +180,16 @@ def _recorded(task: str, scenario: Callable[[Task], Scenario]) -> bytes:
     return record(*_computed(task, scenario, "CERTIFIED"))
 
 
-def _rendered(task: str, scenario: Callable[[Task], Scenario], size: tuple[int, int], browser: str) -> bytes:
-    """Have a browser render a scene, its arm in the middle of its motion, as the page saves it.
+def _rendered(
+    task: str, scenario: Callable[[Task], Scenario], size: tuple[int, int], browser: str, suffix: str, of: str
+) -> bytes:
+    """Have a browser render a scene, its arm in the middle of its motion, as the page saves it; or a video `of` it.
 
     Raises:
         FormatError: it is no browser, and ends.
         TimeoutError: it does not answer.
     """
-    from dt_viz.errors import FormatError  # noqa: PLC0415
+    from dt_viz.errors import FormatError, never  # noqa: PLC0415
     from dt_viz.folders import default_cache_folder  # noqa: PLC0415
     from dt_viz.learning.store import FitStore  # noqa: PLC0415
     from dt_viz.robot.models import load_jaco  # noqa: PLC0415
@@ -202,7 +217,9 @@ def _rendered(task: str, scenario: Callable[[Task], Scenario], size: tuple[int, 
             least = SETTINGS.smallest
             visitor.render_alone((least, least), SETTINGS.patience)  # the browser then has all that was sent
             time.sleep(SETTINGS.drawing)
-            return visitor.render_alone(size, SETTINGS.patience)
+            if suffix == ".png":
+                return visitor.render_alone(size, SETTINGS.patience)
+            return visitor.film(of.title(), suffix, size, lambda _part: None, never, alone=True)
     finally:
         server.close()
 

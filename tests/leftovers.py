@@ -10,10 +10,9 @@ from pathlib import Path
 PATIENCE = 20.0
 """Seconds in which what was told to end may end; reached only by what would never end."""
 OF_POOLS = re.compile(
-    r"ThreadPoolExecutor|asyncio_\d|Dask-Offload|Thread-\d+ \(_do_work\)|pytest|execnet|hypothesis|playwright|messages"
+    r"ThreadPoolExecutor|asyncio_\d|Dask-Offload|Thread-\d+ \(_do_work\)|pytest|execnet|hypothesis|playwright"
 )
-"""Names of threads that a pool starts when it first needs one, which ends with the server that owns it, and of that of
-a page which shows a message for half a minute; it ends with the page."""
+"""Names of threads that a pool starts when it first needs one; a pool ends with the server that owns it."""
 PROC = Path("/proc")
 WATCHED = (Path.cwd(), Path.cwd() / "assets", Path.cwd() / "dt_viz")
 """Folders in which no test may make a file."""

@@ -49,6 +49,7 @@ ONLY_IMPORTERS: Mapping[str, set[str]] = {
     "matplotlib": {"examples/plot.py", "pictures/figures.py"},
     "torch": {"baselines/eflow_training.py"},
     "ompl": {"baselines/mpnet_rrt.py"},
+    "imageio_ffmpeg": {"pictures/video.py"},
     "joblib": {"evaluate/sweep.py"},
     "distributed": {"evaluate/sweep.py"},
     "prometheus_client": {"serving/reports.py"},

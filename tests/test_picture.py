@@ -23,6 +23,11 @@ pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of matp
         (("draw_s", "--out", "f.png", "--size", "1920x100000"), "--size: found '1920x100000'; accepted"),
         (("draw_s", "--out", "f.png", "--size", "large"), "--size: found 'large'; accepted"),
         (
+            ("draw_s", "--out", "f.mp4", "--size", "641x360"),
+            "--size: found '641x360'; accepted: WIDTHxHEIGHT, each even",
+        ),
+        (("draw_s", "--out", "f.gif", "--size", "3840x2160"), "--size: found '3840x2160'; accepted"),
+        (
             ("draw_s", "--out", "nowhere/f.png"),
             "--out: found 'nowhere/f.png'; accepted: a file in a folder that exists",
         ),

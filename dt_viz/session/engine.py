@@ -145,9 +145,7 @@ class Engine:
                 progress(fraction, message)
 
         self.nominal(scenario, learn)
-        shown = [panel.shown for panel in scenario.view.panels if panel.shown]
-        others = {panel: Scenario(panel.task, state=panel.state, arm=scenario.arm) for panel in shown}
-        learned = {panel: self.nominal(other, learn).learned for panel, other in others.items()}
+        learned = self._shown(scenario, learn)
         rank = Rank.BEGINNING if scenario.passing is ANEW else Rank.HAND
         with _cores.slot(rank):
             scenario = newest(scenario)
@@ -156,10 +154,7 @@ class Engine:
         with _cores.slot(rank):
             frame = self._seen(frame, Stage.LIVE, learned)
         yield frame
-        with _cores.slot(Rank.REFINEMENT, cancelled):
-            frame = self._rollouts(scenario, FINE)
-        with _cores.slot(Rank.REFINEMENT, cancelled):
-            frame = self._seen(frame, Stage.FINE, learned)
+        frame = self._fine(scenario, learned, cancelled)
         yield frame
         frame = replace(frame, stage=Stage.CERTIFIED)
         if not frame.blocked:
@@ -172,6 +167,26 @@ class Engine:
             with _cores.slot(Rank.REFINEMENT, cancelled):
                 self.follower.reference_postures(frame.motion.nominal.learned)  # a drag may need them at once
         yield from self._compared_at_rest(frame, cancelled)
+
+    def fine(self, scenario: Scenario, cancelled: Cancelled) -> Frame:
+        """The frame of stage FINE of a learned scenario, which leaves no trace; it raises what `frames` raises."""
+        last = self._last
+        try:
+            return self._fine(scenario, self._shown(scenario), cancelled)
+        finally:
+            self._last = last
+
+    def _fine(self, scenario: Scenario, others: Mapping[Panel, Learned], cancelled: Cancelled) -> Frame:
+        with _cores.slot(Rank.REFINEMENT, cancelled):
+            frame = self._rollouts(scenario, FINE)
+        with _cores.slot(Rank.REFINEMENT, cancelled):
+            return self._seen(frame, Stage.FINE, others)
+
+    def _shown(self, scenario: Scenario, progress: Progress | None = None) -> Mapping[Panel, Learned]:
+        """What is learned of other tasks that panels beside the scene show."""
+        shown = [panel.shown for panel in scenario.view.panels if panel.shown]
+        others = {panel: Scenario(panel.task, state=panel.state, arm=scenario.arm) for panel in shown}
+        return {panel: self.nominal(other, progress).learned for panel, other in others.items()}
 
     # --- motion ---
 

@@ -35,7 +35,7 @@ from dt_viz.ui.tabs.about import Command, add_about, add_commands, numbered
 from dt_viz.ui.tabs.arm import add_arm, add_joints
 from dt_viz.ui.tabs.compare import ComparePanel
 from dt_viz.ui.tabs.opening import OpenPanel, Show
-from dt_viz.ui.tabs.picture import PictureTab, Presentation, big_type
+from dt_viz.ui.tabs.picture import Film, PictureTab, Presentation, big_type
 from dt_viz.ui.tabs.saving import Step
 from dt_viz.ui.tabs.show import ShowTab
 from dt_viz.ui.tabs.stack import StackPanel
@@ -82,6 +82,7 @@ class ControlPanel:
         forget: Callable[[], None] = lambda: None,
         save: Callable[[Session], None] = lambda _session: None,
         record: Callable[[Step], bytes] = lambda _step: b"",
+        film: Film = lambda *_what: b"",
         open_scenario: Callable[[str, bytes], bool] = lambda _name, _content: False,
         pen: Pen | None = None,
         storage: Storage | None = None,
@@ -91,8 +92,9 @@ class ControlPanel:
 
         `render` makes a picture, see `PictureTab`; `send` sends a file whose name ends like this, with a content.
         `save` sends the scenario as a file and must only submit, `record` makes a page that replays what is shown,
-        `open_scenario` goes on with the scenario of a file if it holds one. A visitor teaches with the `pen`.
-        The browser's `storage` keeps where the visitor is in the tour, at whose end `came_back` is called; see `Tour`.
+        `film` a video. `open_scenario` goes on with the scenario of a file if it holds one. A visitor teaches with the
+        `pen`. The browser's `storage` keeps where the visitor is in the tour, at whose end `came_back` is called; see
+        `Tour`.
         """
         self._notify, self._titles = notify, dict(titles)
         self._notified: Message | None = None
@@ -131,7 +133,7 @@ class ControlPanel:
             self._compare = ComparePanel(gui, bindings, send)
         with tabs.add_tab("Picture"):
             act = {"darken": darken, "enlarge": enlarge, "render": render, "draw": self._draw, "record": record}
-            picture = PictureTab(gui, bindings, tripod, self.presentation, send=send, **act)
+            picture = PictureTab(gui, bindings, tripod, self.presentation, film=film, send=send, **act)
         commands = self._commands(gui.main_panel, picture, reset, save, opening)
         add_commands(gui, bindings, commands)
         add_about(gui, bindings, commands, self.tour.take)

@@ -164,8 +164,9 @@ class Playback:
         """Take the arm in the loop, and what draws it; it moves from `begin` on."""
         self.live, self.replay, self.past = live, Replay(), Replay()
         """The arm in the loop, its finished motion, and what it did before `rewind`."""
-        self.arm: LiveArm | Replay = live
-        """What is shown, with its joint angles `q` and `undisturbed`, (n,), rad, and the time since it `arrived`."""
+        self.film: LiveArm | Replay | None = None
+        """What a video shows in place of all else, which waits until there is none any more."""
+        self._arm: LiveArm | Replay = live
         self.recording = Recording()
         self.neglected = False
         """Whether nobody has touched the page for a while, and others need the processor: the goal is not left then."""
@@ -173,6 +174,11 @@ class Playback:
         self._playing, self._speed = True, 1.0
         self._returns = 0
         """Number of times that the robot was shown again after its past."""
+
+    @property
+    def arm(self) -> LiveArm | Replay:
+        """What is drawn, with its joint angles `q` and `undisturbed`, (n,), rad, and the time since it `arrived`."""
+        return self.film or self._arm
 
     @property
     def note(self) -> str:
@@ -186,18 +192,19 @@ class Playback:
     @property
     def player(self) -> Replay | None:
         """What is played in place of the arm in the loop; None while that is shown."""
-        return None if self.arm is self.live else self.past if self.arm is self.past else self.replay
+        return None if self._arm is self.live else self.past if self._arm is self.past else self.replay
 
     @property
     def jumps(self) -> int:
         """Number of times that what is shown has not gone on from where it was."""
-        return self.replay.jumps + self.past.jumps + self._returns
+        players = {player for player in (self.replay, self.past, self.film) if isinstance(player, Replay)}
+        return sum(player.jumps for player in players) + self._returns
 
     @property
     def trace(self) -> tuple[Array, Array]:
-        """What is shown since it set out from a start; see `Replay.trace`."""
-        if (player := self.player) is not None:
-            return player.trace
+        """What is drawn since it set out from a start; see `Replay.trace`."""
+        if isinstance(arm := self.arm, Replay):
+            return arm.trace
         past = self.recording.past
         return (np.empty((0, 0)), np.empty(0)) if past is None else trace(past, past.times[-1])
 
@@ -217,14 +224,14 @@ class Playback:
 
         Later the robot goes on from where the motion was; what it did before stays shown unless the motion is.
         """
-        left = self.arm.q
+        left = self._arm.q
         self._playing, self._speed = playing, speed
         if replays:
-            self.arm = self.replay
-        elif self.arm is self.replay:
+            self._arm = self.replay
+        elif self._arm is self.replay:
             if left is not None:
                 self.live.put(left)
-            self.arm = self.live
+            self._arm = self.live
 
     def rewind(self) -> bool:
         """Show what the robot has done until now, held at its end; return whether there is something.
@@ -237,17 +244,19 @@ class Playback:
         self.live.release()  # a drag of the ball, which is hidden, ends without an event
         self.past.motion = past
         self.past.seek(self.past.duration)
-        self.arm = self.past
+        self._arm = self.past
         return True
 
     def resume(self) -> None:
         """Show the robot again in place of what it did."""
-        if self.arm is self.past:
-            self.arm = self.live
+        if self._arm is self.past:
+            self._arm = self.live
             self._returns += 1
 
     def advance(self, seconds: float) -> None:
         """Let some real time pass, in seconds, and have the arm drawn; called by one thread only."""
+        if self.film is not None:
+            return
         player = self.player
         if player is not self.replay:
             self._go_on(seconds)

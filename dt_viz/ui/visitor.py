@@ -13,9 +13,10 @@ import numpy as np
 import viser
 
 from dt_viz.accounts import Account
-from dt_viz.errors import DataError, FormatError
+from dt_viz.errors import Cancelled, DataError, FormatError, end_if
 from dt_viz.files.uploads import keep_ready, let_go
 from dt_viz.obstacles.shapes import Sphere, TriangleObstacle, as_point
+from dt_viz.pictures.video import check_installed
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.own import Own
 from dt_viz.scenario.relocation import in_world
@@ -37,15 +38,17 @@ from dt_viz.ui.counting import Counted
 from dt_viz.ui.keeping import Keeper
 from dt_viz.ui.panel import ControlPanel
 from dt_viz.ui.pen import Pen
-from dt_viz.ui.playback import Playback
+from dt_viz.ui.playback import Playback, Replay
 from dt_viz.ui.scene.camera import CameraController, Framing, Pose, shot_of, view_of
-from dt_viz.ui.scene.export import RESOLUTIONS, render_png
+from dt_viz.ui.scene.export import RESOLUTIONS, render_frame, render_png
+from dt_viz.ui.scene.film import MOTION, SETTINGS, TURNTABLE, Film, Rendering, encoded, motion, turntable, warping
 from dt_viz.ui.scene.key import Key
-from dt_viz.ui.scene.legend import Legend
+from dt_viz.ui.scene.legend import Legend, legend_in
 from dt_viz.ui.scene.palette import DARK, LIGHT, Colour, Theme
 from dt_viz.ui.scene.recording import record
 from dt_viz.ui.scene.robot_scene import RobotScene
 from dt_viz.ui.scene.scene import ScenePictures
+from dt_viz.ui.scene.studio import Studio
 from dt_viz.ui.scripts import Link, Ruler
 from dt_viz.ui.tabs.saving import Step
 from dt_viz.warning import Severity
@@ -109,6 +112,7 @@ class Visitor(Display):
             self.pictures = ScenePictures(client.scene, robot, lambda: self.session)
             self.robot = RobotScene(client, robot, Playback(engine.arm, self._pose))
         self._exchanging = threading.RLock()  # the arm is moved, and shown or hidden, by other threads
+        self._studio = Studio(self.pictures, lambda: self.robot, self._changing)
         titled = {"": robot.title} if arms is None else arms.titles
         pen = Pen(self.pictures, lambda: self.robot, lambda: self.session, self._face)
         methods = tuple(method.name for method in OTHERS)
@@ -128,6 +132,9 @@ class Visitor(Display):
             self._keeper.forget,
             self._save,
             self._record,
+            lambda what, suffix, resolution, step, cancelled: self.film(
+                what, suffix, RESOLUTIONS[resolution], step, cancelled
+            ),
             self._open,
             pen,
             client.local_storage,
@@ -157,6 +164,10 @@ class Visitor(Display):
             self._camera.measured(what)
 
     def draw(self, frame: Frame, pace: Pace) -> None:
+        with self._studio.drawing:  # a video ends before what was edited meanwhile is drawn
+            self._draw(frame)
+
+    def _draw(self, frame: Frame) -> None:
         beside = tuple(panel.shown for panel in frame.pictures.panels)
         if frame.scenario.arm != (self.shown.scenario.arm if self.shown else ""):
             self._exchange(frame.scenario.arm)
@@ -178,7 +189,7 @@ class Visitor(Display):
         self.shown = frame
 
     def adopt(self, scenario: Scenario) -> None:
-        with self.client.atomic(), self._exchanging:
+        with self._changing():
             self.pictures.adopt(scenario)
             self.robot.adopt(scenario.view, self.pictures.look)
         self._panel.adopt(scenario)
@@ -265,64 +276,155 @@ class Visitor(Display):
         now = time.monotonic()
         self._camera.turn(now)
         with self._exchanging:
-            self.robot.pose(now, self.pictures.look.tubes)
-            self._panel.pose(self.robot.playback)
+            if self.robot.playback.film is None:
+                self.robot.pose(now, self.pictures.look.tubes)
+                self._panel.pose(self.robot.playback)
         self.session.let_pass()
 
     def _exchange(self, name: str) -> None:
         """Draw the arm of a name in place of the one that is drawn."""
         engine = self.session.engines(name)
         robot = engine.follower.robot
-        with self.client.atomic(), self._exchanging:
+        with self._changing():
             self.robot.remove()
             self.robot = RobotScene(self.client, robot, Playback(engine.arm, self._pose))
             self.pictures.take(self.client.scene, robot)
-            self.robot.paint(self._theme)
+            self.robot.paint(self._studio.theme)
             self.robot.adopt(self.session.scenario.view, self.pictures.look)
             self.robot.set_aside(self._previews is not False)
             self._panel.take(robot)
         self.robot.playback.begin(self.session.jobs, self.session.fail)  # and the one before ends
         self._camera.reframe(arm_size=robot.size)
 
+    @contextmanager
+    def _changing(self) -> Iterator[None]:
+        """Show what is changed within this block together, and have no other thread change the arm meanwhile."""
+        with self.client.atomic(), self._exchanging:
+            yield
+
     def _dress(self, theme: Theme) -> None:
-        self._theme = theme
         self.client.gui.configure_theme(
             dark_mode=theme is DARK, show_logo=False, show_share_button=False, brand_color=LIGHT.brand
         )
 
     def _darken(self, dark: bool) -> None:
         """Begin the dark theme, or the light one, on the panel and in the scene."""
-        self._dress(DARK if dark else LIGHT)
-        self._paint(self._theme)
-
-    def _paint(self, theme: Theme) -> None:
-        with self.client.atomic(), self._exchanging:
-            self.pictures.paint(theme)
-            self.robot.paint(theme)
-
-    @contextmanager
-    def _light(self) -> Iterator[None]:
-        """Show the scene in light colours for as long as a picture takes, which is on white."""
-        self._paint(LIGHT)
-        try:
-            yield
-        finally:
-            self._paint(self._theme)
+        self._studio.theme = DARK if dark else LIGHT
+        self._dress(self._studio.theme)
+        self._studio.paint()
 
     def render(self, size: tuple[int, int], *, transparent: bool = False) -> bytes:
         """Render the scene as the visitor sees it, as a PNG of a width and height in pixels; see `render_png`."""
-        with self._light(), self.pictures.without_handles(), self.robot.grip.hidden():
+        with self._studio.rendering():
             return render_png(self.client, size, self._camera.shot(size), self._legends, transparent=transparent)
 
     def render_alone(self, size: tuple[int, int], timeout: float) -> bytes:
         """Render the scene that is shown as `render` does, but framed in all of the picture; `timeout` in seconds."""
-        assert self.shown is not None
-        framing, panels = Framing(size, panel=0.0, narrow=0), [panel.shown for panel in self.shown.pictures.panels]
-        shot = shot_of(view_of(self.shown.task, framing, panels=panels))
         self.robot.playback.advance(0.0)
         self.client.flush()
-        with self._light(), self.pictures.without_handles(), self.robot.grip.hidden():
+        with self._studio.rendering():
+            shot = shot_of(self._pose_alone(size))
             return render_png(self.client, size, shot, self._legends, transparent=False, timeout=timeout)
+
+    def _pose_alone(self, size: tuple[int, int]) -> Pose:
+        """Pose of a camera that frames what is shown in all of a picture of a width and height in pixels."""
+        assert self.shown is not None
+        framing, panels = Framing(size, panel=0.0, narrow=0), [panel.shown for panel in self.shown.pictures.panels]
+        return view_of(self.shown.task, framing, panels=panels)
+
+    def film(
+        self,
+        what: str,
+        suffix: str,
+        size: tuple[int, int],
+        step: Step,
+        cancelled: Cancelled,
+        *,
+        alone: bool = False,
+    ) -> bytes:
+        """Make a video of what is shown, as `render` does; the robot waits meanwhile, and an edit ends it.
+
+        Args:
+            what: `MOTION`, `TURNTABLE` or `WARP`.
+            suffix: of the file, one of `VIDEO_SUFFIXES`.
+            size: width and height, pixels.
+            step: told which part is done.
+            cancelled: tells whether nobody wants it any more.
+            alone: frame what is shown in all of the picture, as `render_alone` does.
+
+        Raises:
+            FormatError: there is nothing to film, the scene is edited meanwhile, or ffmpeg is missing or fails.
+            TimeoutError: the browser does not answer.
+            UnwantedError: it is cancelled.
+        """
+        check_installed()
+        deadline = time.monotonic() + SETTINGS.patience
+        while not self.session.wait_idle(SETTINGS.look):
+            step(0.0)
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"the scene was not at rest within {SETTINGS.patience:g} s")
+        scenario = self.session.scenario
+
+        def ended() -> bool:
+            shown = self._something.scenario.choices == scenario.choices and self._previews is False
+            if not shown or self.session.scenario is not scenario:
+                raise FormatError("the scene", "an edit while it was filmed", "none until the video is saved")
+            return cancelled()
+
+        with self._studio.drawing, self._filmed():
+            end_if(ended)
+            if alone:
+                position, look_at = pose = self._pose_alone(size)
+                shot, depth = shot_of(pose), float(np.linalg.norm(look_at - position))
+            else:
+                shot, depth = self._camera.shot(size), self._camera.depth
+            film = self._film_of(what, self._something, Rendering(shot, self._legends), depth, ended)
+            render = lambda given: render_frame(self.client, size, given.shot, given.legends, 2 * SETTINGS.patience)  # noqa: E731
+            return encoded(film, render, suffix, size, step, ended)
+
+    def _film_of(self, what: str, frame: Frame, rendering: Rendering, depth: float, cancelled: Cancelled) -> Film:
+        """Return a film of a frame that is shown, whose middle is at a depth, metres, in its first rendering."""
+        reel, scenario = Replay(), self.session.scenario
+        reel.motion = frame.arm
+
+        def pose() -> None:
+            with self._exchanging:
+                self.robot.playback.film = reel
+                self.robot.pose(time.monotonic(), self.pictures.look.tubes)
+
+        def draw(warp: float) -> Rendering:
+            warped = self.session.engine.fine(replace(scenario, warp=warp), cancelled)
+            reel.motion = warped.arm
+            with self.client.atomic():
+                self.pictures.draw(warped)
+            legend = legend_in(warped, scenario.view.colour)
+            return Rendering(rendering.shot, [*filter(None, [legend]), *self.pictures.keys])
+
+        if what == TURNTABLE:
+            return turntable(rendering, depth)
+        if frame.blocked or (what == MOTION and frame.arm is None):
+            found = frame.blocked[0].text if frame.blocked else "none that the arm follows"
+            raise FormatError("the motion", found, "one that is shown")
+        return motion(reel, rendering, pose) if what == MOTION else warping(reel, draw, pose)
+
+    @contextmanager
+    def _filmed(self) -> Iterator[None]:
+        """Hold all that moves, as it is rendered, and have it go on in the end as if nothing had been."""
+        playback = self.robot.playback
+        with self._exchanging:
+            playback.film = playback.arm
+        try:
+            with self._studio.rendering():
+                yield
+        finally:
+            if self.shown is not None:
+                with self.client.atomic():
+                    self.pictures.draw(self.shown)
+            with self._changing():
+                playback.film = None
+                self.robot.adopt(self.session.scenario.view, self.pictures.look)
+            self._camera.rest()
+            self.client.flush()
 
     @property
     def _legends(self) -> list[Legend | Key]:
@@ -330,11 +432,16 @@ class Visitor(Display):
         legend = self._panel.legend
         return [*([] if legend is None else [legend]), *self.pictures.keys]
 
+    @property
+    def _something(self) -> Frame:
+        """The frame that is shown; raises FormatError where there is none yet."""
+        if self.shown is None:
+            raise FormatError("the scene", "nothing yet", "a scene that is shown")
+        return self.shown
+
     def _record(self, step: Step) -> bytes:
         """Make a page that replays what is shown; raises FormatError where that is nothing yet."""
-        frame = self.shown
-        if frame is None:
-            raise FormatError("the scene", "nothing yet", "a scene that is shown")
+        frame = self._something
         return record(frame, self.session.engines(frame.scenario.arm).follower, self._camera.chosen, step)
 
     def _send(self, suffix: str, content: bytes) -> None:

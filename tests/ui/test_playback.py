@@ -395,3 +395,22 @@ def test_what_it_did_since_it_set_out_is_traced():
         np.testing.assert_array_equal(replay.trace[0], q[begin:end])
         np.testing.assert_array_equal(replay.trace[1], arrived[begin:end])
         assert replay.arrived == arrived[end - 1] and replay.seeks == (arrived[end - 1] == 0)
+
+
+@pytest.mark.parametrize("shown", ["robot", "motion"])
+def test_a_film_is_drawn_while_all_else_waits_and_goes_on_afterwards(player, shown):
+    playback = player.playback
+    playback.replay.motion = ramp(5.0, 6.0, 2.0)
+    playback.play(True, 1.0, replays=shown == "motion")
+    player.play(0.2)
+    arm, place, jumps = playback.arm, playback.arm.q[0], playback.jumps
+    playback.film = reel = Replay()
+    reel.motion = ramp(8.0, 9.0, 1.0)
+    reel.seek(0.5)
+    assert playback.arm.q[0] == pytest.approx(8.5) and playback.jumps != jumps
+    assert playback.player is (arm if shown == "motion" else None)  # what the timeline steers
+    assert np.ptp(playback.trace[0][:, 0]) == pytest.approx(0.5, abs=0.02)
+    assert player.play(1.0) == []
+    playback.film = None
+    assert playback.arm is arm and arm.q[0] == place and playback.jumps == jumps
+    assert player.play(0.2)[-1] > place

@@ -174,6 +174,13 @@ def shot_of(pose: Pose) -> Shot:
     return Shot(turn.wxyz, pose[0], Framing.field_of_view)
 
 
+def turned_shot(shot: Shot, depth: float, angle: float) -> Shot:
+    """Return a shot turned by an angle, rad, around the vertical through what is in its middle at a depth, metres."""
+    turn, wxyz = SO3.from_z_radians(angle), SO3(shot.wxyz)
+    middle = shot.position + depth * wxyz.as_matrix()[:, 2]
+    return Shot((turn @ wxyz).wxyz, middle + turn @ (shot.position - middle), shot.fov)
+
+
 def shot_beside(pose: Pose, wxyz: Array, framing: Framing, size: tuple[int, int]) -> Shot:
     """Return the camera of a picture that has what the free part of the window shows in its middle, as large as can be.
 
@@ -290,6 +297,11 @@ class CameraController:
         position, look_at = (np.asarray(at, dtype=float) for at in (camera.position, camera.look_at))
         return shot_beside((position, look_at), np.asarray(camera.wxyz, dtype=float), self.framing, size)
 
+    @property
+    def depth(self) -> float:
+        """Distance of what the camera looks at, metres."""
+        return float(np.linalg.norm(np.subtract(self._client.camera.look_at, self._client.camera.position)))
+
     def look(self, task: Task, panels: Sequence[Slice] = ()) -> None:
         """Move the camera to where the task, or the panels beside its scene, are seen best."""
         with self._lock:
@@ -329,6 +341,11 @@ class CameraController:
                 self._turned = now
             if seconds > 0:
                 self._put(turned(self._chosen or self._given[-1], self.framing, TURN * seconds))
+
+    def rest(self) -> None:
+        """Have the orbit go on from where the camera is, however long ago it was turned."""
+        with self._lock:
+            self._turned = None
 
     def _frame(self) -> None:
         if self._shown is not None:

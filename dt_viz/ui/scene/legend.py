@@ -10,6 +10,8 @@ import numpy as np
 from PIL import Image
 
 from dt_viz.pictures.slice_fields import ColourPicture
+from dt_viz.scenario.scenario import SliceColour
+from dt_viz.session.frame import Frame
 from dt_viz.ui.scene.colour_scale import NUM_SHADES, Scale
 from dt_viz.ui.scene.key import INK, Key, plate
 from dt_viz.ui.scene.palette import LIGHT, Colour, css
@@ -85,6 +87,14 @@ OCCUPANCY = Legend(
     tuple((p, f"{p:g}") for p in (0, 0.25, 0.5, 0.75, 1)),
     "Bold line: its level 0.5. Thin line: the true outline",
 )
+
+
+def legend_in(frame: Frame, colour: SliceColour) -> Legend | None:
+    """Return the legend of a colour on the slice of a frame; None if the frame has no picture of it."""
+    picture = frame.pictures.colour
+    if colour == "occupancy":
+        return OCCUPANCY
+    return legend_of(picture) if picture is not None and picture.what == colour else None
 
 
 def legend_of(picture: ColourPicture) -> Legend:

@@ -10,7 +10,7 @@ from dt_viz.flows.fields import Array
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.scenario import View
 from dt_viz.session.frame import Frame, Stage
-from dt_viz.ui.playback import Playback
+from dt_viz.ui.playback import Playback, Replay
 from dt_viz.ui.scene.arm import Arms
 from dt_viz.ui.scene.carried import Carried
 from dt_viz.ui.scene.comparison import TheirArm
@@ -76,7 +76,7 @@ class RobotScene:
         self._show_way()
 
     def _show_way(self) -> None:
-        view, live = self._view, self.playback.player is None
+        view, live = self._view, self.playback.arm is self.playback.live
         self.carried.show(arm=view.arm and not self._aside)
         self.path.visible = view.arm and live and not self._aside
         self.grip.visible = live and (not self._aside or self.grip.guides)
@@ -118,7 +118,7 @@ class RobotScene:
                 self.carried.retrace(self._robot.end_effector(joints) if len(joints) else joints, arrived, self._theme)
             hand = self._robot.end_effector(q)
             sets_out = self.carried.pose(now, hand, arm.arrived, self._theme)
-            clock = playback.replay.clock if arm is playback.replay else None
+            clock = arm.clock if isinstance(arm, Replay) and arm is not playback.past else None
             self.their_arm.pose(now, q, playback.pace, sets_out=sets_out, clock=clock)
             if arm is playback.live:
                 self.path.show(now, hand, lambda: playback.live.ahead, tubes, self._theme)

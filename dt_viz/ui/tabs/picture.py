@@ -9,12 +9,14 @@ from functools import partial
 import viser
 
 from dt_viz.errors import Cancelled
+from dt_viz.pictures.video import VIDEO_SUFFIXES
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.controls import Control, on_press, switch
 from dt_viz.ui.scene.camera import HAND, HOME, VIEWS, CameraController, Framing
 from dt_viz.ui.scene.export import RESOLUTIONS
 from dt_viz.ui.scene.figure import SUFFIXES
+from dt_viz.ui.scene.film import MOTION, TURNTABLE, WARP
 from dt_viz.ui.tabs.about import Command
 from dt_viz.ui.tabs.saving import SaveButton, Step
 
@@ -22,6 +24,13 @@ LARGER = 1.4
 """Factor by which the panel, its type and its controls are larger for a projector."""
 PNG, HTML = "PNG", "HTML"
 """Names of the format that a browser renders, and of a page that replays the motion; others are lines and text."""
+VIDEOS = tuple(suffix[1:].upper() for suffix in VIDEO_SUFFIXES)
+"""Names of the formats of videos."""
+LARGEST_VIDEO = "1920 × 1080"
+"""Largest of the `RESOLUTIONS` that a video may have."""
+SAVE_PICTURE, SAVE_VIDEO = "Save picture", "Save video"
+Film = Callable[[str, str, str, Step, Cancelled], bytes]
+"""Function that makes a video of `MOTION`, `TURNTABLE` or `WARP`, with a suffix, of a resolution."""
 ROW = (
     "<style>div:has(> .dt-row) + div > div > :first-child { width: auto !important; }</style><div class='dt-row'></div>"
 )
@@ -59,12 +68,13 @@ class PictureTab:
         render: Callable[[str, bool], bytes],
         draw: Callable[[str, Step], bytes],
         record: Callable[[Step], bytes],
+        film: Film,
         send: Callable[[str, bytes], None],
     ) -> None:
         """Build the controls where the panel is being built.
 
         `render` makes a PNG, of a resolution, and perhaps transparent, `draw` a file of lines with a suffix, `record` a
-        page that replays the motion.
+        page that replays the motion, `film` a video.
         """
         self._tripod = tripod
         gui.add_html(ROW)
@@ -82,12 +92,17 @@ class PictureTab:
         big = box("Big type", "larger type and controls in a wider panel, to be read from afar")
         self._big = Control(big, enlarge)
         on_press(gui.add_button("Presentation", icon=viser.Icon.PRESENTATION), lambda: presentation.show(True))
-        formats = PNG, *(suffix[1:].upper() for suffix in SUFFIXES), HTML
+        formats = PNG, *(suffix[1:].upper() for suffix in SUFFIXES), HTML, *VIDEOS
         hint = (
             "PNG: the scene as you see it; SVG, PDF: lines and text for a paper, seen from the plane of the task; HTML:"
-            " a page that plays the motion, and can be turned, without a server or network"
+            " a page that plays the motion, and can be turned, without a server or network; MP4, GIF: a video"
         )
         self._format = Control(gui.add_dropdown("Save as", formats, hint=hint), self._choose)
+        hint = (
+            "your browser renders it frame by frame, so keep the page in sight; the robot waits meanwhile, and an edit "
+            "ends it. Turntable: once around what is in the middle of the picture; warp: from 0 to 1"
+        )
+        self._what = Control(gui.add_dropdown("Video of", (MOTION, TURNTABLE, WARP), visible=False, hint=hint))
         self._resolution = Control(gui.add_dropdown("Resolution", tuple(RESOLUTIONS)))
         self._transparent = Control(gui.add_checkbox("Transparent", False))
 
@@ -95,11 +110,13 @@ class PictureTab:
             if self._format.value == PNG:
                 return ".png", render(self._resolution.value, self._transparent.value)
             suffix = f".{self._format.value.lower()}"
+            if self._format.value in VIDEOS:
+                return suffix, film(self._what.value, suffix, self._resolution.value, step, cancelled)
             with session.engine.refining(cancelled):
                 return suffix, record(step) if self._format.value == HTML else draw(suffix, step)
 
         hint = "of the scene, as a file; press again to cancel"
-        SaveButton(gui, bindings, "Save picture", make, send, icon=viser.Icon.CAMERA, hint=hint)
+        self._save = SaveButton(gui, bindings, SAVE_PICTURE, make, send, icon=viser.Icon.CAMERA, hint=hint)
 
     @property
     def commands(self) -> list[Command]:
@@ -116,8 +133,15 @@ class PictureTab:
 
     def _choose(self, chosen: str) -> None:
         """Show what there is to choose of a format."""
-        for control in (self._resolution, self._transparent):
-            control.handle.visible = chosen == PNG
+        is_video, resolutions = chosen in VIDEOS, tuple(RESOLUTIONS)
+        self._transparent.handle.visible = chosen == PNG
+        self._what.handle.visible = is_video
+        self._resolution.handle.visible = is_video or chosen == PNG
+        offered = resolutions[: resolutions.index(LARGEST_VIDEO) + 1] if is_video else resolutions
+        if self._resolution.value not in offered:
+            self._resolution.value = LARGEST_VIDEO
+        self._resolution.handle.options = offered
+        self._save.rename(SAVE_VIDEO if is_video else SAVE_PICTURE)
 
 
 def big_type(gui: viser.GuiApi, tripod: CameraController) -> Callable[[bool], None]:

@@ -12,6 +12,7 @@ from dt_viz.session.session import Session
 from dt_viz.ui.bindings import Bindings
 from dt_viz.warning import Severity
 
+CANCEL = "Cancel"
 Step = Callable[[float], None]
 """Function that is told which part of a file is made, from 0 to 1; it raises UnwantedError where that is cancelled."""
 Make = Callable[[Session, Step, Cancelled], tuple[str, bytes]]
@@ -32,32 +33,39 @@ class SaveButton:
         icon: viser.IconName,
         hint: str,
     ) -> None:
-        """Build the button where the panel is being built; its lane of the session's jobs has its `label`."""
-        self._label, self._make, self._send = label, make, send
+        """Build the button where the panel is being built; its lane of the session's jobs has this `label`."""
+        self._lane = self._label = label
+        self._make, self._send = make, send
         self.button = gui.add_button(label, icon=icon, hint=hint)
         self._bar = gui.add_progress_bar(0.0, visible=False, animated=True)
         bindings.on(self.button, self._press)
 
+    def rename(self, label: str) -> None:
+        """Give the button another label, once it does not cancel."""
+        self._label = label
+        if self.button.label != CANCEL:
+            self.button.label = label
+
     def _press(self, session: Session, _pressed: bool) -> None:
-        if session.jobs.busy(self._label):
-            session.jobs.submit(self._label, lambda: None, latest=True)
+        if session.jobs.busy(self._lane):
+            session.jobs.submit(self._lane, lambda: None, latest=True)
         else:
-            session.jobs.submit(self._label, partial(self._work, session))
+            session.jobs.submit(self._lane, partial(self._work, session))
 
     def _work(self, session: Session) -> None:
-        cancelled = partial(session.jobs.superseded, self._label)
+        cancelled = partial(session.jobs.superseded, self._lane)
 
         def step(fraction: float) -> None:
             end_if(cancelled)
             self._bar.value = 100 * fraction
 
-        self.button.label, self._bar.visible = "Cancel", True
+        label, self.button.label, self._bar.visible = self._label, CANCEL, True
         try:
             suffix, content = self._make(session, step, cancelled)
             step(1.0)
             self._send(suffix, content)
         except (FormatError, TimeoutError) as error:
-            session.say(f"{self._label}: {error}", Severity.WARNING)
+            session.say(f"{label}: {error}", Severity.WARNING)
         finally:
             self.button.label, self._bar.visible = self._label, False
             self._bar.value = 0.0

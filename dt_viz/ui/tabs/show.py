@@ -12,7 +12,7 @@ from dt_viz.scenario.stack import side_by_side
 from dt_viz.session.frame import Frame
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import KEEP, Bindings
-from dt_viz.ui.scene.legend import OCCUPANCY, Legend, legend_of
+from dt_viz.ui.scene.legend import OCCUPANCY, Legend, legend_in
 from dt_viz.ui.tabs.plots import Plots, small
 from dt_viz.ui.tabs.timeline import Timeline
 
@@ -84,8 +84,7 @@ class ShowTab:
         colour, frame = scenario.view.colour, self._bindings.frame
         if colour in {"none", "occupancy"}:
             return OCCUPANCY if colour == "occupancy" else None
-        picture = None if frame is None else frame.pictures.colour
-        return legend_of(picture) if picture is not None and picture.what == colour else KEEP
+        return KEEP if frame is None else legend_in(frame, colour) or KEEP
 
     def _explain(self, legend: Legend | None) -> None:
         self.legend = legend
