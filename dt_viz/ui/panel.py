@@ -156,7 +156,7 @@ class ControlPanel:
     @property
     def headline(self) -> str:
         """Title and status of what is shown, as HTML."""
-        return f"<h3 style='margin:0.4em 0.7em'>{self.presentation.title}</h3>{self.status.line.content}"
+        return f"<h3 style='margin:0.4em 0.7em'>{self.presentation.title}</h3>{self.status.judgement}"
 
     def pose(self, playback: Playback) -> None:
         """Show what a playback shows now on the timeline; called by its thread."""

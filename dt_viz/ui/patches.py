@@ -11,7 +11,8 @@ import functools
 import io
 import socket
 import threading
-from collections.abc import Callable, Iterator
+from collections import OrderedDict
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import ExitStack, contextmanager, redirect_stdout, suppress
 from types import SimpleNamespace
 from typing import Any
@@ -167,6 +168,54 @@ def put_back_pose(gizmo: viser.TransformControlsHandle, position: Any, wxyz: Any
     """
     gizmo._impl.position, gizmo._impl.wxyz = np.full(3, np.nan), np.full(4, np.nan)
     gizmo.position, gizmo.wxyz = position, wxyz
+
+
+NUM_ENCODED = 16
+"""Number of the newest windows of messages that are kept as they are sent."""
+
+
+def encode_once() -> None:
+    """Encode what all clients of a server are sent once for all that are sent the same, not anew for each.
+
+    Hook: a cache in viser's producer of messages.
+    """
+    module: Any = viser.infra._infra
+    original = module._message_producer
+
+    @functools.wraps(original)
+    async def produce(websocket: Any, buffer: Any, client_id: int, backlog_done_message: Any = None) -> None:  # noqa: ANN401
+        if not buffer.persistent_messages:  # those of one client
+            return await original(websocket, buffer, client_id, backlog_done_message)
+        known = vars(buffer).setdefault(
+            "_encoded", OrderedDict()
+        )  # windows, so that their names stay theirs, and bytes
+        windows = buffer.window_generator(client_id, backlog_done_message=backlog_done_message)
+        try:
+            async for window in windows:
+                name = tuple(map(id, window))
+                if name not in known:
+                    known[name] = window, await encoded(window)
+                    while len(known) > NUM_ENCODED:
+                        known.popitem(last=False)
+                await websocket.send(known[name][1])
+        finally:
+            await windows.aclose()
+
+    async def encoded(window: Any) -> bytes:  # noqa: ANN401
+        """Return what viser sends of one window."""
+        sent: list[bytes] = []
+
+        async def once(_client_id: int, backlog_done_message: None) -> AsyncIterator[Any]:  # noqa: ARG001
+            yield window
+
+        async def send(raw: bytes) -> None:
+            sent.append(raw)
+
+        await original(SimpleNamespace(send=send), SimpleNamespace(done=False, window_generator=once), 0)
+        return sent[0]
+
+    if not hasattr(original, "__wrapped__"):
+        module._message_producer = produce
 
 
 SEEN_BY_ALL = ("BackgroundImageMessage", "EnvironmentMapMessage", "EnableLightsMessage", "ThemeConfigurationMessage")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hmac
 import html
+import itertools
 import logging
 import socket
 import threading
@@ -23,14 +24,15 @@ import viser
 from dt_viz.ui import patches
 from dt_viz.ui.controls import Control
 from dt_viz.ui.origins import is_loopback
+from dt_viz.ui.panel import STYLE
 from dt_viz.ui.scene.camera import Framing, Pose, followed, window_size
 from dt_viz.ui.scripts import Ruler, forget_html
 from dt_viz.ui.visitor import Visitor
 
 logger = logging.getLogger(__name__)
 
-PERIOD = 0.1
-"""Shortest time between two moves of a camera that follows, seconds."""
+PERIOD, WORDS = 0.1, 5
+"""Shortest time between two moves of a camera that follows, seconds, and number of these between two texts."""
 AWAY = "The presenter is away: this is the last scene."
 NOT_YET = "The presenter has not come yet."
 """What viewers are told while there is no presenter, after one was there and before."""
@@ -53,8 +55,8 @@ OVER_SCENE = """<div class='dt-address'><style>
 </style>"""
 """Beginning of what shows an address over the scene, so large that a room can scan it."""
 SMALL = """<div class='dt-qr'><style>
-.dt-qr { margin: 0.4em auto 0.8em; width: 9em; text-align: center; font-size: 0.85em; overflow-wrap: anywhere; }
-.dt-qr svg { display: block; width: 100%; height: auto; background: #fff; border-radius: 0.3em; }
+.dt-qr { margin: 0.4em 0.9em 0.8em; text-align: center; font-size: 0.85em; overflow-wrap: anywhere; }
+.dt-qr svg { display: block; width: 10em; height: auto; margin: 0 auto; background: #fff; border-radius: 0.3em; }
 @media (max-width: 36em) { .dt-qr { display: none; } }
 </style>"""
 """Beginning of what shows it on a card; a phone, which has scanned it, has no room for it."""
@@ -92,10 +94,10 @@ class Presenter:
 
     client: viser.ClientHandle
     mirror: patches.Mirror
-    count: viser.GuiHtmlHandle
-    """Says how many watch."""
     visitor: Visitor | None = None
     """The page; None until it is built."""
+    label: str = ""
+    """Title of the panel, with the number of those who watch; empty until it is shown."""
 
 
 class Lecture:
@@ -113,8 +115,9 @@ class Lecture:
         self._lock = threading.RLock()  # viewers come and go in threads of their own
         self._viewers: dict[int, Viewer] = {}
         self._presenter: Presenter | None = None
-        self._headline = NOT_YET
+        self._headline = _line(NOT_YET)
         self._closed = threading.Event()
+        patches.encode_once()
         threading.Thread(target=self._run, name="lecture", daemon=True).start()
 
     @property
@@ -139,7 +142,7 @@ class Lecture:
             hint = "off: your own camera stays where you move it"
             box = client.gui.add_checkbox("Follow the presenter's camera", True, hint=hint)
             viewer.follow = Control(box, lambda _on: setattr(viewer, "seen", None))
-            viewer.qr = client.gui.add_html(f"{SMALL}{self._address_html(client)}</div>")
+            viewer.qr = client.gui.add_html(f"{STYLE}{SMALL}{self._address_html(client)}</div>")
 
     def measured(self, token: str, width: float) -> None:
         """Take the width of a viewer's window, CSS pixels."""
@@ -167,13 +170,11 @@ class Lecture:
         with self._lock:
             viewer.clear()
             before = self._leave()
-            with client.gui.add_folder("Presenting"):
-                count = client.gui.add_html("")
-                large = client.gui.add_html(f"{OVER_SCENE}{self._address_html(client)}</div>", visible=False)
-                hint = "of those who watch, with a QR code, over the scene"
-                box = client.gui.add_checkbox("Show address", False, hint=hint)
+            large = client.gui.add_html(f"{OVER_SCENE}{self._address_html(client)}</div>", visible=False)
+            hint = "of those who watch, with a QR code, over the scene"
+            box = client.gui.add_checkbox("Show address", False, hint=hint)
             Control(box, lambda on: setattr(large, "visible", on))
-            self._presenter = Presenter(client, patches.Mirror(server, client), count)
+            self._presenter = Presenter(client, patches.Mirror(server, client))
         if before is not None:
             before.gui.add_html(forget_html())
         return before
@@ -204,30 +205,40 @@ class Lecture:
         return before.client
 
     def _run(self) -> None:
-        while not self._closed.wait(PERIOD):
+        for number in itertools.count():
+            if self._closed.wait(PERIOD):
+                return
             try:
-                self._tell()
+                self._move()
+                if number % WORDS == 0:
+                    self._tell()
             except Exception:
                 logger.exception("viewers could not be told")
 
-    def _tell(self) -> None:
-        """Tell viewers what is new: what is shown, and where the presenter's camera is."""
+    def _move(self) -> None:
+        """Put the cameras that follow to where the presenter's is."""
         with self._lock:
             presenter, viewers = self._presenter, list(self._viewers.values())
-            visitor = None if presenter is None else presenter.visitor
-            seen = None
-            if visitor is not None:
-                self._headline, seen = visitor.headline, visitor.seen
-            elif presenter is None and self._headline != NOT_YET:
-                self._headline = f"<div style='margin:0.4em 0.9em'>{AWAY}</div>"
-            if presenter is not None:
-                watching = sum(viewer.line is not None for viewer in viewers)
-                presenter.count.content = f"<div style='margin:0.2em 0.9em'>{watching} watch</div>"
-            for viewer in viewers:
+        if presenter is None or presenter.visitor is None or (seen := presenter.visitor.seen) is None:
+            return
+        for viewer in viewers:
+            if viewer.follow is not None and viewer.follow.value:
+                _follow(viewer, seen)
+
+    def _tell(self) -> None:
+        """Tell viewers what is shown, and the presenter how many they are."""
+        with self._lock:
+            presenter, watching = self._presenter, [one for one in self._viewers.values() if one.line is not None]
+            if presenter is None:
+                self._headline = _line(NOT_YET if self._headline == _line(NOT_YET) else AWAY)
+            elif presenter.visitor is not None:
+                self._headline = presenter.visitor.headline
+                if (label := f"DT-Viz · {len(watching)} watch") != presenter.label:
+                    presenter.label = label
+                    presenter.client.gui.set_panel_label(label)
+            for viewer in watching:
                 if viewer.line is not None:
                     viewer.line.content = self._headline
-                if seen is not None and viewer.follow is not None and viewer.follow.value:
-                    _follow(viewer, seen)
 
     def _address_html(self, client: viser.ClientHandle) -> str:
         """Return the address of viewers as a QR code and as a text; see `reachable`."""
@@ -235,6 +246,10 @@ class Lecture:
         code = segno.make(address, micro=False).svg_inline(omitsize=True, border=2)
         note = OWN_MACHINE if is_loopback(urlsplit(address).hostname) else ""
         return f"{code}<b>{html.escape(address)}</b>{note}"
+
+
+def _line(text: str) -> str:
+    return f"<div style='margin:0.4em 0.9em'>{text}</div>"
 
 
 def _follow(viewer: Viewer, seen: tuple[Pose, Framing]) -> None:
