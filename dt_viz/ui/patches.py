@@ -205,7 +205,7 @@ def encode_once() -> None:
         """Return what viser sends of one window."""
         sent: list[bytes] = []
 
-        async def once(_client_id: int, backlog_done_message: None) -> AsyncIterator[Any]:  # noqa: ARG001
+        async def once(_client_id: int, backlog_done_message: None) -> AsyncIterator[Any]:
             yield window
 
         async def send(raw: bytes) -> None:

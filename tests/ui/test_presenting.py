@@ -61,6 +61,10 @@ class Guest(ProtocolClient):
         super().__init__(url, **options)
         self.cameras, self.kinds = [], set()
 
+    async def __aenter__(self):
+        await super().__aenter__()
+        return self
+
     def _apply(self, message, now):
         self.kinds.add(message["type"])
         if message["type"] == CAMERA[0]:
