@@ -35,7 +35,7 @@ class Pace:
 
 @dataclass(frozen=True)
 class Message:
-    """A text for the visitor; it is of interest until another scenario is shown."""
+    """A text for the visitor; it is of interest until another scenario is shown, for a while."""
 
     text: str
     severity: Severity
@@ -130,9 +130,17 @@ class Screen:
             self.progress = replace(self.progress, **changes)
             self._display.tell(self.progress)
 
-    def say(self, text: str, severity: Severity, wanted: Scenario) -> None:
-        """Show a message while a scenario is wanted."""
-        self.tell(message=Message(text, severity, wanted))
+    def say(self, text: str, severity: Severity, wanted: Scenario) -> Message:
+        """Show a message while a scenario is wanted; return it."""
+        message = Message(text, severity, wanted)
+        self.tell(message=message)
+        return message
+
+    def forget(self, message: Message) -> None:
+        """Show a message no longer, unless it tells what has failed: then nothing else would."""
+        with self._telling:
+            if self.progress.message is message and not self.progress.failed:
+                self.tell(message=None)
 
     def draw(self, frame: Frame, edited: float, num_skipped: int, num_edits: int) -> None:
         """Show a frame whose scenario was asked for at a time, of `time.perf_counter`; learning is no rebuild."""

@@ -26,7 +26,7 @@ from dt_viz.session.engine import Engine, wake
 from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.history import History
 from dt_viz.session.jobs import Jobs
-from dt_viz.session.progress import Display, Edits, Screen
+from dt_viz.session.progress import Display, Edits, Message, Screen
 from dt_viz.warning import Severity
 
 logger = logging.getLogger(__name__)
@@ -37,6 +37,10 @@ REST = 0.1
 """Time that a scenario must rest before it is refined, seconds: while a hand moves, edits come faster."""
 LANE, CHOICES = "session", "task"
 """Lanes of the jobs on which the newest scenario is computed, and the task, scene or arm that was chosen last read."""
+MESSAGES = "messages"
+"""Lane of the jobs on which messages pass."""
+READ = 30.0
+"""Time that a message is shown, seconds: enough to look up from the scene, and read it twice."""
 
 
 def _with_a_level_of_its_own(scenario: Scenario) -> Scenario:
@@ -311,8 +315,14 @@ class Session:
         self._screen.tell(expected=expected)
 
     def say(self, text: str, severity: Severity) -> None:
-        """Show a message until another scenario is shown."""
-        self._screen.say(text, severity, self.scenario)
+        """Show a message until another scenario is shown, for `READ` at most; in place of what has failed it stays."""
+        message = self._screen.say(text, severity, self.scenario)
+        self.jobs.submit(MESSAGES, partial(self._let_pass, message), latest=True)
+
+    def _let_pass(self, message: Message) -> None:
+        self.jobs.rest(MESSAGES, READ)
+        if not self.jobs.superseded(MESSAGES):
+            self._screen.forget(message)
 
     def fail(self, error: Exception) -> None:
         """Show what went wrong; what is shown stays."""

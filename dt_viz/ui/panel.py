@@ -123,12 +123,12 @@ class ControlPanel:
         with tabs.add_tab("Stack"):
             StackPanel(gui, bindings)
         with tabs.add_tab("Show"):
-            self.show = ShowTab(gui, bindings)
+            self.show = ShowTab(gui, bindings, send)
         with tabs.add_tab("Arm"):
             add_arm(gui, bindings, arms, self.begin, lambda session: self.show.timeline.show(session, PAST))
             add_joints(gui, bindings, send)
         with tabs.add_tab("Compare"):
-            self._compare = ComparePanel(gui, bindings)
+            self._compare = ComparePanel(gui, bindings, send)
         with tabs.add_tab("Picture"):
             act = {"darken": darken, "enlarge": enlarge, "render": render, "draw": self._draw, "record": record}
             picture = PictureTab(gui, bindings, tripod, self.presentation, send=send, **act)

@@ -256,7 +256,7 @@ def test_methods_are_chosen_in_the_order_of_the_tables_and_their_arm_with_them()
 
 def test_what_is_not_installed_is_grey_with_the_command(server, monkeypatch):
     monkeypatch.setattr("dt_viz.baselines.base.find_spec", lambda _module: None)
-    panel = ComparePanel(server.gui, Bindings())
+    panel = ComparePanel(server.gui, Bindings(), lambda _suffix, _content: None)
     assert not panel.table.visible
     boxes = {box.label: box for box in server.gui._gui_input_handle_from_uuid.values() if hasattr(box, "label")}
     assert boxes["MPNet-RRT"].disabled and not boxes["Modulation"].disabled
@@ -266,7 +266,7 @@ def test_what_is_not_installed_is_grey_with_the_command(server, monkeypatch):
 
 def test_plots_have_a_curve_for_each_method_that_moves(server, beside):
     _, _, frames = beside
-    panel = ComparePanel(server.gui, Bindings())
+    panel = ComparePanel(server.gui, Bindings(), lambda _suffix, _content: None)
     panel.draw(frames[1].comparison)
     assert [len(plot.data) for plot in panel.plots] == [3, 3]  # the slow one is not there yet
     panel.draw(frames[-1].comparison)

@@ -413,6 +413,27 @@ def test_a_message_stays_until_another_scenario_is_shown(opened):
     assert progress.message is None and not progress.failed and progress.complete and not progress.stale
 
 
+def test_a_message_passes_but_for_what_has_failed_and_for_a_newer_one(opened, monkeypatch):
+    session, page, lane = opened.session, opened.page, session_module.MESSAGES
+
+    def text():
+        return None if page.progress.message is None else page.progress.message.text
+
+    monkeypatch.setattr(session_module, "READ", 0.2)
+    session.say("places left out", Severity.WARNING)
+    assert session.jobs.wait_idle(lane, PATIENCE) and text() is None
+    monkeypatch.setattr(session_module, "READ", 60.0)
+    session.say("places left out", Severity.WARNING)
+    older = page.progress.message
+    assert not session.jobs.wait_idle(lane, 0.2) and text() == "places left out"
+    monkeypatch.setattr(session_module, "READ", 0.2)
+    session.fail(ValueError("it fails"))
+    assert session.jobs.wait_idle(lane, PATIENCE) and text() == "ValueError: it fails"
+    session._screen.tell(failed=False)
+    session._screen.forget(older)
+    assert text() == "ValueError: it fails"
+
+
 def test_what_is_shown_is_stale_while_another_task_is_expected_read_or_learned(opened):
     assert opened.page.progress.complete
     for expected in (True, False):

@@ -259,7 +259,7 @@ def test_the_key_of_methods_stands_above_the_legend_of_colours():
 @pytest.fixture
 def opened(server):
     bound = Bound(SCENARIO)
-    yield ShowTab(server.gui, bound), bound
+    yield ShowTab(server.gui, bound, lambda _suffix, _content: None), bound
     server.gui.reset()
 
 

@@ -74,9 +74,9 @@ def test_the_outermost_transform_is_on_top_and_the_base_at_the_bottom():
 def test_each_row_tells_the_duration_that_was_chosen_and_offers_what_can_be_done():
     by_name = listed(SCENARIO)
     assert [by_name[name].label for name in ("Bias 1", "Bias 2", AVOIDANCE)] == [
-        "Bias 1, strength 0.80",
+        "Bias 1, strength\u00a00.80",
         "Bias 2",
-        "Avoidance, t 0.40",
+        "Avoidance, t\u00a00.40",
     ]
     assert by_name["Bias 1"].buttons == (ON, UP, SHOW)
     assert by_name["Bias 2"].buttons == (ON, UP, DOWN, SHOW)
@@ -126,7 +126,7 @@ def test_rows_are_reused_and_hidden_when_the_stack_shrinks(server):
     bound.adopt(SCENARIO)
     bound.report(frame())
     shown = [handle.label for handle in panel.rows if handle.visible]
-    assert shown == ["Avoidance, t 0.40", "Bias 2", "Bias 1, strength 0.80", IMITATION, BASE]
+    assert shown == ["Avoidance, t\u00a00.40", "Bias 2", "Bias 1, strength\u00a00.80", IMITATION, BASE]
     bound.adopt(changed(SCENARIO, layers=(), obstacles=()))
     assert [handle.label for handle in panel.rows if handle.visible] == [IMITATION, BASE]
     bound.adopt(SCENARIO)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from html import escape
@@ -17,10 +17,12 @@ from dt_viz.motion.profiles import NUM_SAMPLES
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.session.comparison import OTHERS, OURS
 from dt_viz.session.frame import Compared
+from dt_viz.session.session import Session
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.comparison import COLOURS
 from dt_viz.ui.scene.palette import css
+from dt_viz.ui.tabs.data import SAVE, curves_table, scores_table, table_csv
 from dt_viz.ui.tabs.plots import add_plot, columns, curve, small
 
 NONE = "–"
@@ -40,7 +42,10 @@ TITLES = ("Distance to the demonstration [mm]", "Depth of the hand in the obstac
 class ComparePanel:
     """Controls of the comparison, its table, and figure 6 of the paper for one motion."""
 
-    def __init__(self, gui: viser.GuiApi, bindings: Bindings) -> None:
+    def __init__(self, gui: viser.GuiApi, bindings: Bindings, send: Callable[[str, bytes], None]) -> None:
+        """Build the controls where the panel is being built; `send` gets the end of a file's name, and its content."""
+        self._send = send
+        self._comparison: Sequence[Compared] = ()
         self._drawn: tuple[Method, ...] = ()
         """Methods in the plots."""
         with gui.add_folder("Methods"):  # closed by a click, so that the table is seen at once on a small screen
@@ -59,13 +64,17 @@ class ComparePanel:
         )
         with (folder := gui.add_folder("Along the path (fig. 6)", visible=False)):
             self.plots = tuple(add_plot(gui, title, "path", _curves(()), 130) for title in TITLES)
-        for handle in (folder, self.table):
+        what = "the table, and the curves of the plots, as CSV"
+        save = gui.add_button(SAVE, icon=viser.Icon.DOWNLOAD, hint=what, visible=False)
+        bindings.later(save, self._save)
+        for handle in (folder, self.table, save):
             bindings.properties(handle, visible=lambda s: bool(s.view.compared))
 
     def draw(self, comparison: Sequence[Compared]) -> None:
         """Show how methods fare; nothing leaves what is there."""
         if not comparison:
             return
+        self._comparison = comparison
         self.table.content = table_html(comparison)
         plotted = [compared for compared in comparison if compared.curves is not None]
         methods = tuple(compared.method for compared in plotted)
@@ -76,6 +85,13 @@ class ComparePanel:
                 plot.series = (uplot.Series(label="path"), *_curves(methods))
             plot.data = columns(along, *(curve[:, k] for curve in curves)) if curves else (np.zeros(2),) * 2
         self._drawn = methods
+
+    def _save(self, _session: Session, _pressed: bool) -> None:
+        for name, table in (
+            ("methods", scores_table(self._comparison)),
+            ("methods-path", curves_table(self._comparison)),
+        ):
+            self._send(f"-{name}.csv", table_csv(table))
 
 
 def hint(method: Method) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
 from typing import Any, Literal
@@ -18,11 +18,13 @@ from dt_viz.motion.following import ArmMotion
 from dt_viz.motion.profiles import Profiles
 from dt_viz.robot.robot import Robot
 from dt_viz.session.frame import Frame
+from dt_viz.session.session import Session
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.playback import Replay
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.palette import Colour, css
 from dt_viz.ui.scene.picture import Following, Shown
+from dt_viz.ui.tabs.data import SAVE, joints_table, path_table, table_csv
 
 NUM_SAMPLES, RATE = 80, 10
 """Number of samples of a curve over time, few enough to be sent during a drag, and of a long one for each second."""
@@ -226,8 +228,9 @@ class HealthPlots(Shown):
 class Plots:
     """All plots of one visitor: each below its checkbox, or, large, in a window."""
 
-    def __init__(self, gui: viser.GuiApi, bindings: Bindings) -> None:
-        """Build them with their checkboxes where the panel is being built."""
+    def __init__(self, gui: viser.GuiApi, bindings: Bindings, send: Callable[[str, bytes], None]) -> None:
+        """Build them with their checkboxes where the panel is being built; `send` gets a name's end, and a content."""
+        self._send = send
         self.joints: list[JointPlots] = []
         self.health: list[HealthPlots] = []
         self._robot: Robot | None = None
@@ -236,16 +239,21 @@ class Plots:
         """Path of the hand (T, 3) along which the health is plotted, metres."""
         self._past: ArmMotion | None = None
         """What the robot did, while that is shown."""
+        self._profiles: Profiles | None = None
         for name, kind, made in (("joint_plots", JointPlots, self.joints), ("health_plots", HealthPlots, self.health)):
             bindings.checkbox(gui, name)
             for large in (False, True):
                 shown = lambda s, name=name, large=large: getattr(s.view, name) and s.view.large_plots == large  # noqa: E731
                 made.append(bindings.properties(kind(gui, large=large), visible=shown))
-        bindings.checkbox(gui, "large_plots", visible=lambda s: s.view.joint_plots or s.view.health_plots)
+        any_shown = lambda s: s.view.joint_plots or s.view.health_plots  # noqa: E731
+        bindings.checkbox(gui, "large_plots", visible=any_shown)
+        hint = "of the shown plots, as CSV: joints at the motion’s own samples, and what is told along the path"
+        save = gui.add_button(SAVE, icon=viser.Icon.DOWNLOAD, hint=hint, visible=False)
+        bindings.later(save, self._save, visible=any_shown)
 
     def take(self, robot: Robot) -> None:
         """Show a robot's motions from now on."""
-        self._robot, self._motion, self._path, self._past = robot, None, None, None
+        self._robot, self._motion, self._path, self._past, self._profiles = robot, None, None, None, None
         for plots in self.joints:
             plots.take(robot)
 
@@ -255,6 +263,7 @@ class Plots:
         path = frame.rollouts[frame.chosen] if frame.chosen is not None and len(frame.rollouts) else ()
         self._path = path if len(path) > 1 else None
         self._draw_joints()
+        self._profiles = frame.profiles or self._profiles
         for plots in self.health:
             plots.draw(frame.profiles)
 
@@ -277,6 +286,13 @@ class Plots:
     def _draw_joints(self) -> None:
         for plots in self.joints:
             plots.follow(self._past or self._motion)
+
+    def _save(self, session: Session, _pressed: bool) -> None:
+        motion, view = self._past or self._motion, session.scenario.view
+        if view.joint_plots and motion is not None and self._robot is not None:
+            self._send("-joints.csv", table_csv(joints_table(motion, self._robot)))
+        if view.health_plots and self._profiles is not None:
+            self._send("-path.csv", table_csv(path_table(self._profiles)))
 
 
 def place_along(path: Array, place: Array) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import viser
@@ -37,12 +38,13 @@ IN_SCENE = (
 class ShowTab:
     """The controls of one visitor's tab."""
 
-    def __init__(self, gui: viser.GuiApi, bindings: Bindings) -> None:
+    def __init__(self, gui: viser.GuiApi, bindings: Bindings, send: Callable[[str, bytes], None]) -> None:
+        """Build the controls where the panel is being built; `send` gets the end of a file's name, and its content."""
         self._bindings = bindings
         self.legend: Legend | None = None
         """Legend of the colours that are shown on the slice."""
         self._add_slice(gui, bindings)
-        self.plots = Plots(gui, bindings)  # high up in the tab, to be seen when it opens
+        self.plots = Plots(gui, bindings, send)  # high up in the tab, to be seen when it opens
         self.timeline = Timeline(gui, bindings, self.plots)
         for name in IN_SCENE:
             if name == "panels":

@@ -167,7 +167,7 @@ def _part(index: str, colour: Colour) -> str:
 
 
 def _label(name: str, duration: float | None, what: str = "t") -> str:
-    return name if duration is None else f"{name}, {what} {duration:.2f}"
+    return name if duration is None else f"{name}, {what}\u00a0{duration:.2f}"
 
 
 def _look(scenario: Scenario, name: str) -> str:
