@@ -55,7 +55,6 @@ class ProtocolClient:
             origin: origin of the page that it imitates; None sends none.
             protocol: WebSocket subprotocol; that of the installed viser if None.
         """
-        self.url = url
         self._connect = partial(
             connect,
             url,
@@ -164,7 +163,7 @@ class ProtocolClient:
         """Tell a server that has one scene for all the key of its presenter, as a script on the page does."""
         texts = " ".join(str(control.get("content", "")) for control in self.controls.values())
         token = re.findall(r"window/([\w-]+)/present/", texts)[-1]
-        address = f"http{self.url.removeprefix('ws').rstrip('/')}/window/{token}/present/{key}"
+        address = f"http{self._connect.args[0].removeprefix('ws').rstrip('/')}/window/{token}/present/{key}"
         (await asyncio.to_thread(urlopen, address)).close()
 
     async def set(self, label: str, value: bool | float | str) -> None:

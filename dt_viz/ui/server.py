@@ -95,7 +95,6 @@ class Server:
         self._new_visitor: Callable[[viser.ClientHandle], Visitor] = lambda client: Visitor(
             client, arms.engine(), robot, titles, task, arms, self._share, accounts.opened(self.gate.address(client))
         )
-        self._max_sessions = max_sessions
         self._lock = threading.Condition()
         self._visitors: dict[int, Visitor | None] = {}
         """Those with a page, and None for those whose page is being built."""
@@ -144,7 +143,7 @@ class Server:
             for _, said, came in self._waiting.values():
                 if said is not None:
                     said.content = self._full(came)
-        if self._lecture is None and self._share.num_waiting and self._share.num_visitors >= self._max_sessions:
+        if self._lecture is None and self._share.num_waiting and self._share.num_visitors >= self.gate.limits.places:
             quietest = max(self.visitors, key=lambda visitor: self.gate.idle(visitor.client), default=None)
             if quietest is not None and self.gate.idle(quietest.client) > IDLE:
                 notify(quietest.client, LEAVING, COLOURS[Severity.WARNING][0])
@@ -155,7 +154,7 @@ class Server:
         num_before = self._share.num_before(came)
         line = f"**{num_before} before you.** " if num_before else "**You are next.** "
         return (
-            f"**All {self._max_sessions} places are taken.** {line}This page opens by itself when a place is free: "
+            f"**All {self.gate.limits.places} places are taken.** {line}This page opens by itself when a place is free: "
             "close another tab of this demo, or wait. Whoever runs the server can allow more with `--max-sessions`."
         )
 
@@ -181,7 +180,7 @@ class Server:
         with self._lock:
             if self._closed or client.client_id not in self._server.get_clients():
                 return  # left before its turn came
-            came, is_full = time.monotonic(), self._share.num_visitors >= self._max_sessions
+            came, is_full = time.monotonic(), self._share.num_visitors >= self.gate.limits.places
             said = client.gui.add_markdown(self._full(came)) if is_full else None
             self._waiting[client.client_id] = client, said, came
             self._tell()
@@ -198,7 +197,7 @@ class Server:
         with self._lock:
             if self._closed or not self._waiting:
                 return
-            with self._share.next_place(self._max_sessions) as is_free:
+            with self._share.next_place(self.gate.limits.places) as is_free:
                 if not is_free:
                     return
                 client, said, _ = self._waiting.pop(next(iter(self._waiting)))

@@ -101,7 +101,8 @@ def test_an_edit_is_answered_by_a_picture_of_it_or_of_a_later_one_in_time(visit)
 
 def test_in_a_lecture_a_quarter_drags_and_one_in_twenty_changes_the_task():
     rest, lecture, all_drag = (
-        Namespace(rest=rest, lecture=lecture) for rest, lecture in ((True, False), (False, True), (False, False))
+        Namespace(rest=rest, lecture=lecture, present=False)
+        for rest, lecture in ((True, False), (False, True), (False, False))
     )
     roles = [load.roles_of(options, 40) for options in (rest, lecture, all_drag)]
     assert [sum(role in load.DRAGS for role in each) for each in roles] == [0, 10, 40]
