@@ -155,7 +155,8 @@ class Server:
         line = f"**{num_before} before you.** " if num_before else "**You are next.** "
         return (
             f"**All {self.gate.limits.places} places are taken.** {line}This page opens by itself when a place is "
-            "free: close another tab of this demo, or wait. Whoever runs the server can allow more with `--max-sessions`."
+            "free: close another tab of this demo, or wait. Whoever runs the server can allow more with "
+            "`--max-sessions`."
         )
 
     def close(self) -> None:
