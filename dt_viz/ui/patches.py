@@ -178,8 +178,13 @@ def encode_once() -> None:
     """Encode what all clients of a server are sent once for all that are sent the same, not anew for each.
 
     Hook: a cache in viser's producer of messages.
+
+    Raises:
+        GateError: viser does not produce them as expected.
     """
     module: Any = viser.infra._infra
+    if not hasattr(module, "_message_producer"):
+        raise GateError("its producer of messages")
     original = module._message_producer
 
     @functools.wraps(original)

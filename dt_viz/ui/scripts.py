@@ -8,7 +8,8 @@ pixel at first, and fewer where drawing is slow. What lies beside the canvas, su
 pixels. So the page asks for an address that has the width in it, again whenever that changes.
 
 The server is not told what the address of the page says behind its `?`, as viser connects without that. So the page
-asks for an address that has it, too, and takes it out of its own: a reload goes on with what was made of it.
+asks for an address that has it, too, and takes it out of its own: a reload goes on with what was made of it. The key of
+a presenter is told likewise, and is kept by the tab.
 """
 
 from __future__ import annotations
