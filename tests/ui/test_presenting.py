@@ -6,6 +6,7 @@ import functools
 import json
 import urllib.error
 import urllib.request
+import warnings
 
 import numpy as np
 import pytest
@@ -109,6 +110,11 @@ async def moved_to(presenter, place):
     await presenter.release()
 
 
+def shared(server):
+    """Messages that whoever comes is sent."""
+    return list(server._server._websock_server.get_message_buffer().message_from_id.values())
+
+
 def stands_at(guest, place):
     return np.allclose(guest.nodes.get(OBSTACLE, {}).get("position", 0), place)
 
@@ -206,8 +212,11 @@ async def test_who_comes_later_with_the_key_takes_over_and_who_leaves_is_missed(
             await moved_to(first, (0.12, -0.5, 0.4))
             assert await viewer.wait_for(lambda: stands_at(viewer, (0.12, -0.5, 0.4)), PATIENCE)
             assert await first.wait_for(lambda: "0.12" in first.storage.get(KEPT, ""), PATIENCE)
+            (before,), kept = server.visitors, dict(first.storage)
+            await first.set("Add", "Sphere")
+            assert await viewer.wait_for(lambda: "/obstacles/1" in viewer.nodes, PATIENCE)
             async with Guest(url) as second:
-                second.storage = dict(first.storage)  # of one browser
+                second.storage = kept  # what this browser kept before
                 await second.look()
                 assert await second.wait_for(lambda: second.says("dt-qr"), PATIENCE)
                 await second.present(KEY)
@@ -216,9 +225,15 @@ async def test_who_comes_later_with_the_key_takes_over_and_who_leaves_is_missed(
                 assert TAKEN in first.notices and first.says("removeItem")
                 assert await second.wait_for(lambda: second.has_picture, PATIENCE)
                 assert await second.wait_for(lambda: stands_at(second, (0.12, -0.5, 0.4)), PATIENCE)
+                assert await viewer.wait_for(lambda: "/obstacles/1" not in viewer.nodes, PATIENCE)
                 await moved_to(second, (0.1, -0.55, 0.4))
                 assert await viewer.wait_for(lambda: stands_at(viewer, (0.1, -0.55, 0.4)), PATIENCE)
                 assert len(server.visitors) == 1 and not viewer.says(AWAY)
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")  # he has gone
+                    before.client.scene.add_frame("/gone")
+                assert await second.ping() < PATIENCE and "/gone" not in viewer.nodes
+                assert not any(getattr(one, "name", "") == "/gone" for one in shared(server))
         assert await viewer.wait_for(lambda: viewer.says(AWAY), PATIENCE)
         assert viewer.has_rollouts and stands_at(viewer, (0.1, -0.55, 0.4))
 
