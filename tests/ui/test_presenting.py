@@ -254,6 +254,13 @@ async def test_the_camera_follows_until_that_is_switched_off_and_again_from_then
         assert not await sees((0.9, -2.0, 0.9), viewer)
         await viewer.set(FOLLOW, True)
         assert await sees((0.9, -2.0, 0.9), viewer)
+        followed_last = viewer.cameras[-1]
+        await viewer.set(FOLLOW, False)
+        await viewer.look_from((-0.5, -1.5, 0.6))
+        viewer.cameras.clear()
+        await viewer.set(FOLLOW, True)  # while the presenter's rests
+        assert await viewer.wait_for(lambda: viewer.cameras, 5)
+        np.testing.assert_allclose(viewer.cameras[-1], followed_last, atol=1e-6)
 
 
 def test_who_follows_sees_all_that_the_presenter_sees_and_in_the_same_window_the_same():
