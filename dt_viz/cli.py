@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 import os
+import secrets
 import signal
 import socket
 import sys
@@ -35,6 +36,8 @@ MAX_PROCESSES, MOST_BY_DEFAULT = 64, 4
 """Largest number of processes that may be asked for, and that are taken unasked."""
 LOADED = 2.0
 """Time, seconds, within which compiled code is loaded, so that nothing is said of it."""
+MAX_SESSIONS, MAX_WATCHING = 8, 50
+"""Largest numbers of visitors unless they are chosen: each with a private scene, and all with one."""
 MEASURE, PICTURE = "evaluate", "picture"
 """Subcommands of the measurements and of pictures; without one the demo starts."""
 
@@ -100,8 +103,13 @@ def _serve(options: argparse.Namespace) -> int:
 
     def ready() -> None:
         host = f"[{options.host}]" if ":" in options.host else options.host
-        print(f"DT-Viz is at http://{host}:{listening.getsockname()[1]} (Ctrl-C stops it)", flush=True)
+        address = f"http://{host}:{listening.getsockname()[1]}"
+        print(f"DT-Viz is at {address} (Ctrl-C stops it)", flush=True)
+        if key is not None:
+            print(f"Who presents is at {address}/?present={key}; all others watch", flush=True)
 
+    key = secrets.token_urlsafe(16) if options.present else None
+    max_sessions = options.max_sessions or (MAX_WATCHING if options.present else MAX_SESSIONS)
     new_server = partial(
         Server,
         tasks,
@@ -109,12 +117,13 @@ def _serve(options: argparse.Namespace) -> int:
         robot,
         task=begin,
         host=options.host,
-        max_sessions=options.max_sessions,
+        max_sessions=max_sessions,
         max_of_address=options.max_of_address,
         allowed=options.allow_origin,
+        key=key,
     )
     prepare = partial(_prepare, fits, tasks[begin](), robot)
-    num_processes, num_connections = _num_processes(options.processes), options.max_sessions + MAX_WAITING
+    num_processes, num_connections = 1 if key else _num_processes(options.processes), max_sessions + MAX_WAITING
     with listening:
         if num_processes == 1:
             return _work(new_server, prepare, own_share(num_connections), listening, ready)
@@ -180,7 +189,7 @@ def _num_processes(asked: int | None) -> int:
 
 
 def _unused(options: argparse.Namespace) -> str:
-    """Say which options do nothing without another one; empty where there is none."""
+    """Say which options do nothing without another one, or cannot be had with one; empty where there is none."""
     for names, needs, given in (
         (("end_effector", "home", "front", "srdf", "package_dir"), "--urdf", options.urdf),
         (("rate", "unit", "columns", "topic"), "FILE", options.files),
@@ -188,6 +197,8 @@ def _unused(options: argparse.Namespace) -> str:
         unused = [f"--{name.replace('_', '-')}" for name in names if getattr(options, name) not in (None, [])]
         if unused and not given:
             return f"{', '.join(unused)}: found without {needs}; accepted: with {needs}"
+    if options.present and (options.processes or 1) > 1:
+        return f"--processes: found {options.processes}; accepted: 1 with --present, as one process has the scene"
     return ""
 
 
@@ -275,13 +286,22 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--lasa", type=Path, metavar="DIR", help="folder of LASA .mat files, each becomes a task")
     parser.add_argument(
-        "--max-sessions", type=_positive, default=8, help="visitors at a time; others wait (default: %(default)s)"
+        "--max-sessions",
+        type=_positive,
+        metavar="N",
+        help=f"visitors at a time; others wait (default: {MAX_SESSIONS}; {MAX_WATCHING} with --present)",
+    )
+    parser.add_argument(
+        "--present",
+        action="store_true",
+        help="one scene for all: whoever opens the address with the key, which is printed, edits it; others watch",
     )
     parser.add_argument(
         "--max-of-address",
         type=_positive,
         metavar="N",
-        help="visitors of one address that is not this machine's (default: half of all; a room may share one)",
+        help="visitors of one address that is not this machine's, as a room may share one (default: half of all; all "
+        "with --present)",
     )
     parser.add_argument(
         "--processes",

@@ -124,6 +124,23 @@ def test_handlers_of_signals_are_as_before_when_it_returns(capsys):
     assert "found 'nothing'" in capsys.readouterr().err
 
 
+def test_the_key_of_the_presenter_is_printed_and_another_one_each_time(monkeypatch, capsys):
+    started = []
+
+    def serve(*_what, **how):
+        started.append(how)
+        raise GateError("it would be ready")
+
+    monkeypatch.setattr(server, "Server", serve)
+    for _ in range(2):
+        main(["--present", "--port", "0"])
+    main(["--port", "0", "--processes", "1"])
+    one, other, private = started
+    assert len(one["key"]) > 20 and one["key"] != other["key"] and private["key"] is None
+    assert (one["max_sessions"], private["max_sessions"]) == (50, 8)
+    assert "it would be ready" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "status", "words"),
     [
@@ -139,6 +156,7 @@ def test_handlers_of_signals_are_as_before_when_it_returns(capsys):
             (f"--processes {number}", 2, f"argument --processes: found '{number}'; accepted: 1 to 64")
             for number in ("0", "-1", "1000", "two")
         ),
+        ("--present --processes 2", 2, "--processes: found 2; accepted: 1 with --present"),
         ("--allow-origin demo.org", 2, "argument --allow-origin: found 'demo.org'; accepted: http://"),
     ],
 )

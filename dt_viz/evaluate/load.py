@@ -23,7 +23,8 @@ all (figures of different machines compare in this unit), and under ``visits`` f
     number of WebSocket messages that each visitor receives.
 
 With ``--rest`` nobody drags: the visitors look on while the arm goes its round. With ``--lecture`` a quarter drags in
-bursts, one in twenty changes the task again and again, and the others look on.
+bursts, one in twenty changes the task again and again, and the others look on. With ``--present`` one more drags, who
+presents the one scene that the visitors watch: their pictures answer its edits.
 """
 
 from __future__ import annotations
@@ -81,6 +82,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--rest", action="store_true", help="drag nothing: measure what visitors cost who look on")
     what.add_argument("--lecture", action="store_true", help="most look on, some drag in bursts, few change the task")
+    what.add_argument("--present", action="store_true", help="one more drags what all others watch")
     parser.add_argument("--url", type=_url, help="of a server that runs already, such as ws://127.0.0.1:8080")
     parser.add_argument("--out", type=Path, metavar="FILE.json")
 
@@ -93,12 +95,13 @@ def run(options: argparse.Namespace) -> int:
     print(f"{task.name}; a fixed piece of numpy work takes {unit:.1f} ms")
     visits = []
     for number in options.visitors:
-        with _server(options, number) as (url, process):
-            visits.append(asyncio.run(_visited(options, url, process, task, number)))
+        with _server(options, number) as (url, process, key):
+            visits.append(asyncio.run(_visited(options, url, process, key, task, number)))
     report([_row(figures) for figures in visits])
     if out is not None:
         settings = {
-            name: getattr(options, name) for name in ("avoid", "seconds", "after", "rest", "lecture", "processes")
+            name: getattr(options, name)
+            for name in ("avoid", "seconds", "after", "rest", "lecture", "present", "processes")
         }
         settings["task"] = task.name
         machine = {"cores": os.cpu_count(), "python": platform.python_version(), "numpy": np.__version__}
@@ -108,13 +111,17 @@ def run(options: argparse.Namespace) -> int:
 
 
 async def _visited(
-    options: argparse.Namespace, url: str, process: int | None, task: Task, number: int
+    options: argparse.Namespace, url: str, process: int | None, key: str, task: Task, number: int
 ) -> dict[str, Any]:
-    """Open the page so many times, drag in all, and return the figures; see the module."""
+    """Open the page so many times, drag in all, and return the figures; see the module.
+
+    With the key of a presenter one more page drags, and the others watch.
+    """
     async with AsyncExitStack() as stack:
+        presenter = await _presenter(stack, url, key, options.avoid) if key else None
         clients = [ProtocolClient(url) for _ in range(number)]
         began = time.perf_counter()
-        firsts = await asyncio.gather(*(_first_picture(stack, client, options.avoid, began) for client in clients))
+        firsts = await asyncio.gather(*(_first_picture(stack, client, options, began) for client in clients))
         figures: dict[str, Any] = {"clients": number, "first_picture_s": firsts, "visitors": []}
         if None in firsts:
             return figures
@@ -128,7 +135,11 @@ async def _visited(
             _doing(options, visit, role, places_of(task, k, num_edits), first)
             for k, (visit, role, first) in enumerate(zip(visits, roles, beginnings, strict=True))
         )
-        await asyncio.gather(*map(_measured, visits, doings))
+        if presenter is not None:
+            for visit in visits:
+                visit.watch(presenter)
+            doings = [presenter.drag(places_of(task, 0, num_edits)), *doings]
+        await asyncio.gather(*map(_measured, [*([] if presenter is None else [presenter]), *visits], doings))
         elapsed, after = time.perf_counter() - began, used(process)
         num_messages = sum(client.num_messages for client in clients) - num_before
         for visit in visits:
@@ -139,7 +150,7 @@ async def _visited(
         seconds = num_edits / SETTINGS.edits_per_second
         return figures | {
             "visitors": [
-                visit.figures(seconds) if role in DRAGS else {"lost": visit.lost}
+                visit.figures(seconds) if visit.sent else {"lost": visit.lost}
                 for visit, role in zip(visits, roles, strict=True)
             ],
             "ping_ms": spread(np.array([ping for visit in visits for ping in visit.pings])),
@@ -149,17 +160,33 @@ async def _visited(
         }
 
 
+async def _presenter(stack: AsyncExitStack, url: str, key: str, avoid: str | None) -> Visit:
+    """Open the presenter's page; return what it does once it has a picture."""
+    client = await stack.enter_async_context(ProtocolClient(url))
+    await client.look()
+    await client.wait_for(lambda: client.controls, SETTINGS.first_picture)
+    await client.present(key)
+    if not await client.wait_for(lambda: client.has_picture, SETTINGS.first_picture):
+        raise LostError("the presenter has no picture")
+    if avoid is not None:
+        await client.set("Avoid", avoid.capitalize())
+    return Visit(client)
+
+
 async def _first_picture(
-    stack: AsyncExitStack, client: ProtocolClient, avoid: str | None, began: float
+    stack: AsyncExitStack, client: ProtocolClient, options: argparse.Namespace, began: float
 ) -> float | None:
     """Open a page; return the seconds until it has a picture, None if it has none in time."""
     try:
         await stack.enter_async_context(client)
         await client.look()
-        if await client.wait_for(lambda: client.has_picture, SETTINGS.first_picture):
+        watches = options.present  # who watches has no details of the status
+        if await client.wait_for(
+            lambda: client.has_rollouts if watches else client.has_picture, SETTINGS.first_picture
+        ):
             elapsed = time.perf_counter() - began
-            if avoid is not None:
-                await client.set("Avoid", avoid.capitalize())
+            if options.avoid is not None and not watches:
+                await client.set("Avoid", options.avoid.capitalize())
             return elapsed
     except (LostError, OSError) as error:
         print(f"a visitor was lost: {error}", file=sys.stderr)
@@ -181,7 +208,7 @@ DRAGS = (_Role.DRAG, _Role.DRAG_IN_BURSTS)
 def roles_of(options: argparse.Namespace, number: int) -> list[_Role]:
     """Return what each of so many visitors does: in a lecture at random, as processes take visitors in turn."""
     if not options.lecture:
-        return [_Role.LOOK_ON if options.rest else _Role.DRAG] * number
+        return [_Role.LOOK_ON if options.rest or options.present else _Role.DRAG] * number
     num_dragging, num_changing = (round(part * number) for part in (SETTINGS.dragging, SETTINGS.changing))
     roles = [_Role.DRAG_IN_BURSTS] * num_dragging + [_Role.CHANGE_TASK] * num_changing
     roles += [_Role.LOOK_ON] * (number - len(roles))
@@ -222,23 +249,32 @@ async def _measured(visit: Visit, doing: Awaitable[None]) -> None:
 
 
 @contextmanager
-def _server(options: argparse.Namespace, number: int) -> Iterator[tuple[str, int | None]]:
-    """Yield the address of the WebSocket, and the server's process if it is started here."""
+def _server(options: argparse.Namespace, number: int) -> Iterator[tuple[str, int | None, str]]:
+    """Yield the address of the WebSocket, the server's process if it is started here, and the presenter's key."""
     if options.url is not None:
-        yield options.url, None
+        yield options.url, None, ""
         return
     arguments = ["--task", options.task, "--max-sessions", str(number)]
     if options.processes is not None:
         arguments += ["--processes", str(options.processes)]
     if options.lasa is not None:
         arguments += ["--lasa", str(options.lasa)]
-    with started(arguments) as (url, process):
-        yield url, process
+    if options.present:
+        arguments.append("--present")
+    with launched(arguments) as (url, process, key):
+        yield url, process, key
 
 
 @contextmanager
 def started(arguments: Sequence[str], log: IO[str] | None = None) -> Iterator[tuple[str, int]]:
-    """Start a server on a free port; yield the address of its WebSocket, and its process.
+    """Start a server as `launched` does; yield the address of its WebSocket, and its process."""
+    with launched(arguments, log) as (url, process, _):
+        yield url, process
+
+
+@contextmanager
+def launched(arguments: Sequence[str], log: IO[str] | None = None) -> Iterator[tuple[str, int, str]]:
+    """Start a server on a free port; yield its WebSocket's address, its process, and its presenter's key, if any.
 
     Args:
         arguments: options of `dt-viz`.
@@ -256,7 +292,9 @@ def started(arguments: Sequence[str], log: IO[str] | None = None) -> Iterator[tu
             address = next((match[1] for match in found if match), None)
             if address is None:
                 raise FormatError(" ".join(arguments), "a server that does not start", "one that does: see above")
-            yield f"ws://{address}", process.pid
+            line = process.stdout.readline() if "--present" in arguments else ""
+            key = re.search(r"present=([\w-]+)", line)
+            yield f"ws://{address}", process.pid, "" if key is None else key[1]
         finally:
             process.terminate()
 

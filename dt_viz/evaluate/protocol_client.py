@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import asyncio
 import math
+import re
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from importlib.metadata import version
 from types import TracebackType
 from typing import Any
+from urllib.request import urlopen
 from uuid import uuid4
 
 import msgspec
@@ -141,9 +143,14 @@ class ProtocolClient:
         return self._ended is not None
 
     @property
+    def has_rollouts(self) -> bool:
+        """Whether rollouts are on the page; before the first there is a triangle without size."""
+        return bool(np.ptp(self.nodes.get(ROLLOUT, {}).get("vertices", 0)) > 0)
+
+    @property
     def has_picture(self) -> bool:
-        """Whether rollouts and their status are on the page; before the first there is a triangle without size."""
-        return np.ptp(self.nodes.get(ROLLOUT, {}).get("vertices", 0)) > 0 and bool(self.status)
+        """Whether rollouts and their status are on the page."""
+        return self.has_rollouts and bool(self.status)
 
     def find(self, label: str) -> str:
         """Return the identifier of the control with this label, of several the first that is shown. Raises KeyError."""
@@ -151,6 +158,13 @@ class ProtocolClient:
         if not shown:
             raise KeyError(label)
         return max(shown, key=shown.__getitem__)
+
+    async def present(self, key: str) -> None:
+        """Tell a server that has one scene for all the key of its presenter, as a script on the page does."""
+        texts = " ".join(str(control.get("content", "")) for control in self.controls.values())
+        token = re.findall(r"window/([\w-]+)/present/", texts)[-1]
+        address = f"http{self._connect.args[0].removeprefix('ws').rstrip('/')}/window/{token}/present/{key}"
+        (await asyncio.to_thread(urlopen, address)).close()
 
     async def set(self, label: str, value: bool | float | str) -> None:
         """Set the value of a control."""

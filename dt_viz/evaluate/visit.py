@@ -76,6 +76,10 @@ class Visit:
         if edit > (self.seen[-1][0] if self.seen else -1):
             self.seen.append((edit, now, self.client.num_bytes))
 
+    def watch(self, presenter: Visit) -> None:
+        """See what answers the edits of another visitor, now and later."""
+        self.edits, self.sent, self.client.changed = presenter.edits, presenter.sent, self.see
+
     async def drag(self, places: Sequence[Point]) -> None:
         """Drag the obstacle through places, and let it go."""
         self.client.changed = self.see

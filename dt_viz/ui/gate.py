@@ -235,6 +235,14 @@ class Gate:
         connection = None if self._server is None else patches.connection_of(self._server, client.client_id)
         return "" if connection is None else self._connections.get(connection, (0, ""))[1]
 
+    def page(self, client: viser.ClientHandle) -> str:
+        """Return the origin of a client's page in its browser, such as http://10.0.0.1:8080; empty if it has left."""
+        connection = None if self._server is None else patches.connection_of(self._server, client.client_id)
+        if connection is None:
+            return ""
+        headers = connection.request.headers
+        return headers.get("Origin") or f"http://{headers['Host']}"
+
     def idle(self, client: viser.ClientHandle) -> float:
         """Return the time since a client sent something, seconds; 0 if it has left."""
         connection = None if self._server is None else patches.connection_of(self._server, client.client_id)

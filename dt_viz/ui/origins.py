@@ -126,6 +126,11 @@ def address_of(peer: str, forwarded: Iterable[str]) -> str:
     return "" if address.is_loopback else str(network)
 
 
+def is_loopback(host: str | None) -> bool:
+    """Return whether a host is this machine, as only itself sees it."""
+    return host is not None and _canonical(host) == LOOPBACK
+
+
 def _split(text: str) -> SplitResult | None:
     """Split a URL; return None if it has no host, an invalid port, or further parts."""
     try:

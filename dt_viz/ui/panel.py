@@ -155,6 +155,11 @@ class ControlPanel:
         """Legend of the colours on the slice."""
         return self.show.legend
 
+    @property
+    def headline(self) -> str:
+        """Title and status of what is shown, as HTML."""
+        return f"<h3 style='margin:0.4em 0.7em'>{self.presentation.title}</h3>{self.status.judgement}"
+
     def pose(self, playback: Playback) -> None:
         """Show what a playback shows now on the timeline; called by its thread."""
         self.show.timeline.follow(playback)

@@ -6,12 +6,14 @@ Each function names the public hook that would replace it. What it needs is chec
 from __future__ import annotations
 
 import asyncio
+import copy
 import functools
 import io
 import socket
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stdout, suppress
+from collections import OrderedDict
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import ExitStack, contextmanager, redirect_stdout, suppress
 from types import SimpleNamespace
 from typing import Any
 
@@ -166,6 +168,133 @@ def put_back_pose(gizmo: viser.TransformControlsHandle, position: Any, wxyz: Any
     """
     gizmo._impl.position, gizmo._impl.wxyz = np.full(3, np.nan), np.full(4, np.nan)
     gizmo.position, gizmo.wxyz = position, wxyz
+
+
+NUM_ENCODED = 16
+"""Number of the newest windows of messages that are kept as they are sent."""
+
+
+def encode_once() -> None:
+    """Encode what all clients of a server are sent once for all that are sent the same, not anew for each.
+
+    Hook: a cache in viser's producer of messages.
+
+    Raises:
+        GateError: viser does not produce them as expected.
+    """
+    module: Any = viser.infra._infra
+    if not hasattr(module, "_message_producer"):
+        raise GateError("its producer of messages")
+    original = module._message_producer
+
+    @functools.wraps(original)
+    async def produce(websocket: Any, buffer: Any, client_id: int, backlog_done_message: Any = None) -> None:  # noqa: ANN401
+        if not buffer.persistent_messages:  # those of one client
+            return await original(websocket, buffer, client_id, backlog_done_message)
+        known = vars(buffer).setdefault(
+            "_encoded", OrderedDict()
+        )  # windows, so that their names stay theirs, and bytes
+        windows = buffer.window_generator(client_id, backlog_done_message=backlog_done_message)
+        try:
+            async for window in windows:
+                name = tuple(map(id, window))
+                if name not in known:
+                    known[name] = window, await encoded(window)
+                    while len(known) > NUM_ENCODED:
+                        known.popitem(last=False)
+                await websocket.send(known[name][1])
+        finally:
+            await windows.aclose()
+
+    async def encoded(window: Any) -> bytes:  # noqa: ANN401
+        """Return what viser sends of one window."""
+        sent: list[bytes] = []
+
+        async def once(_client_id: int, backlog_done_message: None) -> AsyncIterator[Any]:
+            yield window
+
+        async def send(raw: bytes) -> None:
+            sent.append(raw)
+
+        await original(SimpleNamespace(send=send), SimpleNamespace(done=False, window_generator=once), 0)
+        return sent[0]
+
+    if not hasattr(original, "__wrapped__"):
+        module._message_producer = produce
+
+
+SEEN_BY_ALL = ("BackgroundImageMessage", "EnvironmentMapMessage", "EnableLightsMessage", "ThemeConfigurationMessage")
+"""Messages beside those of the scene's nodes that a `Mirror` passes on, by viser's name."""
+
+
+class Mirror:
+    """The scene of one client as all others see it, also later ones: what is drawn in it is drawn once for all.
+
+    Nothing in the copy can be clicked or dragged, and viser's server knows no node of it: gizmos are plain frames, and
+    what a client listens to, its panel and its camera are not passed on.
+
+    Hook: nodes that are drawn in one scope, and handled in another one.
+    """
+
+    def __init__(self, server: viser.ViserServer, client: viser.ClientHandle) -> None:
+        """Begin with an empty scene, in place of what was mirrored before; then all that the client is sent counts."""
+        self._shared, self._connection = server._websock_server, client._websock_connection
+        self._excluded, self._gizmos = client.client_id, set[str]()
+        buffer = self._shared.get_message_buffer()
+        with buffer.buffer_lock:
+            nodes = [one for one in buffer.message_from_id.values() if one.entity_type == "scene"]
+        names = {one.name for one in nodes if one.lifecycle_phase == "create"}  # pyright: ignore[reportAttributeAccessIssue]
+        self._before = names - server.scene._handle_from_node_name.keys()
+        with self._shared.atomic():
+            for name in self._before:
+                self._shared.queue_message(viser._messages.RemoveSceneNodeMessage(name))
+        self._alone = self._connection.atomic
+        replaced: Any = self._connection
+        with self._connection._record_lock:
+            replaced._record_handles.append(self)
+            replaced.atomic = self._atomic
+
+    def end(self) -> None:
+        """Leave the copy as it is."""
+        replaced: Any = self._connection
+        with self._connection._record_lock:
+            replaced._record_handles.remove(self)
+            replaced.atomic = self._alone
+
+    @contextmanager
+    def _atomic(self) -> Iterator[None]:
+        with ExitStack() as stack:
+            stack.enter_context(self._alone())
+            stack.enter_context(self._shared.atomic())
+            yield
+
+    def _insert_message(self, message: Any) -> None:  # noqa: ANN401 - of viser, which calls this for each
+        """Pass on a message that the client is sent, if all may see what it draws."""
+        messages, name = viser._messages, getattr(message, "name", "")
+        if message.entity_type != "scene" and type(message).__name__ not in SEEN_BY_ALL:
+            return
+        if message.lifecycle_phase in ("create", "remove"):
+            self._gizmos.discard(name)
+        if isinstance(message, messages.TransformControlsMessage):
+            self._gizmos.add(name)
+            look = {"show_axes": False, "axes_length": 0.0, "axes_radius": 0.0, "origin_radius": 0.0}
+            copied: Any = messages.FrameMessage(name, messages.FrameProps(**look, origin_color=(0, 0, 0), scale=1.0))
+        elif name in self._gizmos and isinstance(message, messages.SceneNodeUpdateMessage):
+            return  # how large the handles are, and which
+        else:
+            copied = copy.copy(message)
+        if message.entity_type == "scene":
+            copied.owner = ""
+        copied.excluded_self_client = self._excluded
+        if message.lifecycle_phase == "create":
+            self._shared.get_message_buffer().remove_entity_state_from_buffer("scene", name)
+        self._shared.queue_message(copied)
+        if message.lifecycle_phase == "create" and name in self._before:  # a browser would leave it where it was
+            for pose in (
+                messages.SetOrientationMessage(name, (1.0, 0.0, 0.0, 0.0)),
+                messages.SetPositionMessage(name, (0.0, 0.0, 0.0)),
+            ):
+                self._shared.queue_message(pose)
 
 
 class Tape(viser.infra.WebsockMessageHandler):

@@ -8,7 +8,8 @@ pixel at first, and fewer where drawing is slow. What lies beside the canvas, su
 pixels. So the page asks for an address that has the width in it, again whenever that changes.
 
 The server is not told what the address of the page says behind its `?`, as viser connects without that. So the page
-asks for an address that has it, too, and takes it out of its own: a reload goes on with what was made of it.
+asks for an address that has it, too, and takes it out of its own: a reload goes on with what was made of it. The key of
+a presenter is told likewise, and is kept by the tab.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from __future__ import annotations
 import html
 import re
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from urllib.parse import unquote
 
@@ -144,6 +145,24 @@ mark.parentElement.firstElementChild.scrollIntoView({block: 'nearest'});
 The page's camera, which these keys turn too, does not hear of it; what is typed in, and sliders, keep them.
 """
 
+PRESENT = """
+const name = 'dt-viz-present', page = new window.URL(location.href);
+let key = page.searchParams.get('present');
+try {
+  if (key) sessionStorage.setItem(name, key);
+  else key = sessionStorage.getItem(name);
+  page.searchParams.delete('present');
+  history.replaceState(history.state, '', page);
+} catch {}
+if (key) fetch('ADDRESS/present/' + encodeURIComponent(key), {cache: 'no-store'});
+"""
+"""Tells the key of a presenter, and takes it out of the address: the tab keeps it, and tells it again after a reload.
+
+Where nothing is kept it stays in the address.
+"""
+FORGET = "try { sessionStorage.removeItem('dt-viz-present'); } catch {}"
+"""Keeps the key no longer."""
+
 KINDS = ("scene", "task", "tour")
 """Kinds of things that a link may ask for."""
 
@@ -158,8 +177,8 @@ class Link:
     """Name of a scene or a task, or number of a step of the tour, from 1; the first one if empty."""
 
 
-Told = Callable[[str, "float | Link"], None]
-"""Callback that takes the token of a ruler, and the width of its window, CSS pixels, or what the link asks for."""
+Told = Callable[[str, "float | Link | Claim"], None]
+"""Callback that takes the token of a ruler, and the width of its window, CSS pixels, the link's wish, or a key."""
 
 
 class Ruler:
@@ -172,11 +191,29 @@ class Ruler:
     @property
     def html(self) -> str:
         """What is to stand on the page, unseen."""
-        return _run(MEASURE.replace("ADDRESS", f"{FOLDER}/{self.token}").replace("KINDS", str([*KINDS])))
+        return self._measures(KINDS)
+
+    @property
+    def asking_html(self) -> str:
+        """What is to stand on the page of who watches, or has the key: what else a link asks for is left in it."""
+        return self._measures(()) + _run(PRESENT.replace("ADDRESS", f"{FOLDER}/{self.token}"))
+
+    def _measures(self, kinds: Sequence[str]) -> str:
+        return _run(MEASURE.replace("ADDRESS", f"{FOLDER}/{self.token}").replace("KINDS", str([*kinds])))
 
 
-def told(path: str) -> tuple[str, float | Link] | None:
-    """Return the token, and the width, CSS pixels, or the link that a request's path tells; None if it tells none."""
+@dataclass(frozen=True)
+class Claim:
+    """The claim to be the presenter."""
+
+    key: str
+
+
+def told(path: str) -> tuple[str, float | Link | Claim] | None:
+    """Return the token, and the width, CSS pixels, the link or the key of a request's path; None if it has none."""
+    claimed = re.search(rf"/{FOLDER}/([\w-]+)/present/([\w-]{{1,{LONGEST}}})$", path, re.ASCII)
+    if claimed:
+        return claimed[1], Claim(claimed[2])
     asked = re.search(rf"/{FOLDER}/([\w-]+)/({'|'.join(KINDS)})/([\w.!~*'()%-]{{0,{LONGEST}}})$", path, re.ASCII)
     if asked:
         return asked[1], Link(asked[2], unquote(asked[3])[:LONGEST])
@@ -192,6 +229,11 @@ def drop_html(button: viser.GuiUploadButtonHandle, most: int) -> str:
 def arrows_html(back: str, following: str) -> str:
     """Return what is to stand before a group of buttons on the page, unseen; these are the names of two of them."""
     return _run(ARROWS.replace("BACK", repr(back)).replace("NEXT", repr(following)))
+
+
+def forget_html() -> str:
+    """Return what is to stand on the page, unseen, of who is the presenter no longer."""
+    return _run(FORGET)
 
 
 def _run(script: str) -> str:

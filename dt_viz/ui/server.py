@@ -24,7 +24,8 @@ from dt_viz.ui.gate import Gate, Limits
 from dt_viz.ui.keeping import KEY
 from dt_viz.ui.origins import Origin, Origins
 from dt_viz.ui.panel import MAX_UPLOAD
-from dt_viz.ui.scripts import Link
+from dt_viz.ui.presenting import TAKEN, WRONG, Lecture, Viewer
+from dt_viz.ui.scripts import Claim, Link, forget_html
 from dt_viz.ui.tabs.status import COLOURS
 from dt_viz.ui.visitor import Visitor, notify
 from dt_viz.warning import Severity
@@ -64,6 +65,7 @@ class Server:
         max_waiting: int = MAX_WAITING,
         max_of_address: int | None = None,
         allowed: Sequence[Origin] = (),
+        key: str | None = None,
     ) -> None:
         """Listen and wait for visitors.
 
@@ -78,8 +80,10 @@ class Server:
             port: port to listen on; 0 takes any free one.
             max_sessions: largest number of visitors; further ones wait until one leaves.
             max_waiting: largest number of those who wait; any more are refused.
-            max_of_address: largest number of visitors, also waiting ones, of one address; None is half of all.
+            max_of_address: largest number of visitors, also waiting ones, of one address; None is half of all, and all
+                with a key, as a lecture hall may have one address.
             allowed: origins of other pages that may connect; see `Origins`.
+            key: makes all visitors watch the one who has it; see `Lecture`. Without one each has a private scene.
 
         Raises:
             AddressError: the address is not available.
@@ -91,7 +95,6 @@ class Server:
         self._new_visitor: Callable[[viser.ClientHandle], Visitor] = lambda client: Visitor(
             client, arms.engine(), robot, titles, task, arms, self._share, accounts.opened(self.gate.address(client))
         )
-        self._max_sessions = max_sessions
         self._lock = threading.Condition()
         self._visitors: dict[int, Visitor | None] = {}
         """Those with a page, and None for those whose page is being built."""
@@ -101,11 +104,11 @@ class Server:
         """Number of pages that are being built, also for visitors who have left meanwhile."""
         self._closed = False
         connections = max_sessions + max_waiting
-        limits = Limits(
-            max_sessions, connections, upload=MAX_UPLOAD, of_address=max_of_address or max(2, connections // 2)
-        )
+        most = max(2, connections // 2) if key is None else connections
+        limits = Limits(max_sessions, connections, upload=MAX_UPLOAD, of_address=max_of_address or most)
         self._share = share or own_share(connections)
         self.gate = Gate(Origins(host, allowed), limits, _refuse, self._told, self._share)
+        self._lecture = None if key is None else Lecture(key, host, self.gate.page)
         self._server = self.gate.open(listening, "DT-Viz")
         self.host, self.port = host, self._server.get_port()
         self._server.gui.configure_theme(show_logo=False, show_share_button=False)
@@ -140,7 +143,7 @@ class Server:
             for _, said, came in self._waiting.values():
                 if said is not None:
                     said.content = self._full(came)
-        if self._share.num_waiting and self._share.num_visitors >= self._max_sessions:
+        if self._lecture is None and self._share.num_waiting and self._share.num_visitors >= self.gate.limits.places:
             quietest = max(self.visitors, key=lambda visitor: self.gate.idle(visitor.client), default=None)
             if quietest is not None and self.gate.idle(quietest.client) > IDLE:
                 notify(quietest.client, LEAVING, COLOURS[Severity.WARNING][0])
@@ -151,14 +154,17 @@ class Server:
         num_before = self._share.num_before(came)
         line = f"**{num_before} before you.** " if num_before else "**You are next.** "
         return (
-            f"**All {self._max_sessions} places are taken.** {line}This page opens by itself when a place is free: "
-            "close another tab of this demo, or wait. Whoever runs the server can allow more with `--max-sessions`."
+            f"**All {self.gate.limits.places} places are taken.** {line}This page opens by itself when a place is "
+            "free: close another tab of this demo, or wait. Whoever runs the server can allow more with "
+            "`--max-sessions`."
         )
 
     def close(self) -> None:
         """Close all pages and stop listening."""
         patience = 2.0  # seconds
         self._share.close()
+        if self._lecture is not None:
+            self._lecture.close()
         for client in self._server.get_clients().values():
             notify(client, CLOSING, COLOURS[Severity.WARNING][0])
         with self._lock:
@@ -175,10 +181,12 @@ class Server:
         with self._lock:
             if self._closed or client.client_id not in self._server.get_clients():
                 return  # left before its turn came
-            came, is_full = time.monotonic(), self._share.num_visitors >= self._max_sessions
+            came, is_full = time.monotonic(), self._share.num_visitors >= self.gate.limits.places
             said = client.gui.add_markdown(self._full(came)) if is_full else None
             self._waiting[client.client_id] = client, said, came
             self._tell()
+            if self._lecture is not None:
+                self._lecture.ask(client)
         self._admit()
 
     def _tell(self) -> None:
@@ -190,7 +198,7 @@ class Server:
         with self._lock:
             if self._closed or not self._waiting:
                 return
-            with self._share.next_place(self._max_sessions) as is_free:
+            with self._share.next_place(self.gate.limits.places) as is_free:
                 if not is_free:
                     return
                 client, said, _ = self._waiting.pop(next(iter(self._waiting)))
@@ -200,11 +208,38 @@ class Server:
         try:
             if said is not None:
                 said.remove()
+            if self._lecture is None:
+                self._build_page(client)
+            else:
+                self._lecture.welcome(client)
+        finally:
+            self._built()
+
+    def _built(self) -> None:
+        with self._lock:
+            self._num_building -= 1
+            self._lock.notify_all()
+
+    def _present(self, lecture: Lecture, viewer: Viewer) -> None:
+        """Build the presenter's page in place of a viewer's; it takes a place, also if none is free."""
+        client = viewer.client
+        with self._lock:
+            if self._closed or client.client_id not in self._server.get_clients():
+                return
+            _, said, _ = self._waiting.pop(client.client_id, (client, None, 0.0))
+            self._visitors[client.client_id] = None
+            self._tell()
+            self._num_building += 1
+        try:
+            if said is not None:
+                said.remove()
+            before = lecture.take(self._server, viewer)
+            if before is not None:
+                notify(before, TAKEN, COLOURS[Severity.WARNING][0])
+                self.gate.disconnect(before)
             self._build_page(client)
         finally:
-            with self._lock:
-                self._num_building -= 1
-                self._lock.notify_all()
+            self._built()
 
     def _build_page(self, client: viser.ClientHandle) -> None:
         try:
@@ -219,19 +254,39 @@ class Server:
             if client.client_id in self._visitors:
                 self._visitors[client.client_id] = visitor
                 visitor.measure()
+                if self._lecture is not None:
+                    self._lecture.begin(visitor)
                 return
         visitor.close()  # left while the page was being built
 
-    def _told(self, token: str, what: float | Link) -> None:
+    def _told(self, token: str, what: float | Link | Claim) -> None:
+        if isinstance(what, Claim):
+            self._claimed(token, what.key)
+            return
+        if self._lecture is not None and not isinstance(what, Link):
+            self._lecture.measured(token, what)
         for visitor in self.visitors:
             if visitor.ruler.token == token:
                 visitor.told(what)
+
+    def _claimed(self, token: str, key: str) -> None:
+        """Let whoever has told the key present, beside the server's event loop."""
+        viewer, is_right = (None, False) if self._lecture is None else self._lecture.claimed(token, key)
+        if viewer is None:
+            return
+        if is_right:
+            threading.Thread(target=self._present, args=(self._lecture, viewer), name="presenting").start()
+        else:
+            notify(viewer.client, WRONG, COLOURS[Severity.WARNING][0])
+            viewer.client.gui.add_html(forget_html())
 
     def _farewell(self, client: viser.ClientHandle) -> None:
         with self._lock:
             visitor = self._visitors.pop(client.client_id, None)
             self._waiting.pop(client.client_id, None)
             self._tell()
+            if self._lecture is not None:
+                self._lecture.farewell(client)
         if visitor is not None:
             visitor.close()
         self._admit()

@@ -163,6 +163,16 @@ class Visitor(Display):
         else:
             self._camera.measured(what)
 
+    @property
+    def headline(self) -> str:
+        """What is shown, and its status, as HTML."""
+        return self._panel.headline
+
+    @property
+    def seen(self) -> tuple[Pose, Framing] | None:
+        """Where the camera is, as the browser told, and the window; None where that is nowhere."""
+        return self._camera.seen
+
     def draw(self, frame: Frame, pace: Pace) -> None:
         with self._studio.drawing:  # a video ends before what was edited meanwhile is drawn
             self._draw(frame)

@@ -51,6 +51,17 @@ def show(visit, edit, now):
     visit.see(ROLLOUT, {"vertices": None}, now)
 
 
+def test_who_watches_sees_the_edits_of_another_answered(visit):
+    client: Any = SimpleNamespace(nodes={ANSWERED: {}}, num_bytes=0)
+    viewer = Visit(client)
+    viewer.watch(visit)
+    viewer.client.nodes[ANSWERED]["position"] = next(at for at, number in visit.edits.items() if number == 2)
+    viewer.client.changed(ROLLOUT, {"vertices": None}, 5.25)
+    figures = viewer.figures(0.4)
+    assert figures["latency_ms"] == {"median": pytest.approx(50), "p95": pytest.approx(50), "worst": pytest.approx(50)}
+    assert not viewer.last_shown and not visit.seen
+
+
 def test_places_are_on_a_circle_in_the_slice_around_the_obstacle_and_none_comes_twice():
     task = TASKS["draw_s"]()
     places = places_of(task, 3, 500)
@@ -90,7 +101,8 @@ def test_an_edit_is_answered_by_a_picture_of_it_or_of_a_later_one_in_time(visit)
 
 def test_in_a_lecture_a_quarter_drags_and_one_in_twenty_changes_the_task():
     rest, lecture, all_drag = (
-        Namespace(rest=rest, lecture=lecture) for rest, lecture in ((True, False), (False, True), (False, False))
+        Namespace(rest=rest, lecture=lecture, present=False)
+        for rest, lecture in ((True, False), (False, True), (False, False))
     )
     roles = [load.roles_of(options, 40) for options in (rest, lecture, all_drag)]
     assert [sum(role in load.DRAGS for role in each) for each in roles] == [0, 10, 40]

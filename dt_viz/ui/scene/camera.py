@@ -202,6 +202,21 @@ def shot_beside(pose: Pose, wxyz: Array, framing: Framing, size: tuple[int, int]
     return Shot(wxyz, position + beside, float(2 * np.arctan(half)))
 
 
+def followed(pose: Pose, framing: Framing, own: Framing) -> Pose:
+    """Return the camera that shows, in the free part of its own window, all that another one shows in that of its.
+
+    Args:
+        pose: of the other camera, metres; it does not look straight up or down.
+        framing: the other window.
+        own: the window of the camera that follows.
+    """
+    position, look_at = pose
+    (ahead, right, up), depth = axes(look_at - position), np.linalg.norm(look_at - position)
+    across, upright = (tangents[:, None] for tangents in framing.free)
+    sides, heights = position + depth * (ahead + across * right), position + depth * (ahead + upright * up)
+    return framed(np.concatenate([sides, heights]), ahead, *own.free)
+
+
 def framed(points: Array, direction: Array, across: Array, upright: Array) -> Pose:
     """Return the nearest camera that sees all points within a part of its picture.
 
@@ -290,6 +305,15 @@ class CameraController:
     def framing(self) -> Framing:
         """The framing in the window as it is now."""
         return replace(self._framing, size=window_size(self._client.camera, self._width))
+
+    @property
+    def seen(self) -> tuple[Pose, Framing] | None:
+        """Where the camera is, as the browser told, and the window; None where it looks straight up or down."""
+        camera = self._client.camera
+        position, look_at = (gestures.vector(place, 3, MAX_SIGHT) for place in (camera.position, camera.look_at))
+        if position is None or look_at is None or np.linalg.norm((look_at - position)[:2]) < MOVED:
+            return None
+        return (position, look_at), self.framing
 
     def shot(self, size: tuple[int, int]) -> Shot:
         """Return the camera of a picture, of a width and height in pixels, of what is seen beside the panel."""

@@ -179,6 +179,11 @@ class Presentation:
         return self._html.visible
 
     @property
+    def title(self) -> str:
+        """Title of what is shown, as HTML."""
+        return self._texts["title"]
+
+    @property
     def commands(self) -> list[Command]:
         """Begin and end it; the scenes can be turned with the panel, too."""
         return [

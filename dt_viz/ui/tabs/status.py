@@ -355,6 +355,8 @@ class StatusLine:
     def __init__(self, gui: viser.GuiApi, bindings: Bindings) -> None:
         """Build the controls where the panel is being built; the buttons act on the session of the bindings."""
         self._told: Progress | None = None
+        self.judgement = ""
+        """What is known of what is shown, as HTML, without what only its visitor is told."""
         self.line = gui.add_html("")
         self.mend = gui.add_button("Mend", icon=viser.Icon.SHIELD_CHECK, visible=False)
         self.cancel = gui.add_button("Cancel", icon=viser.Icon.X, visible=False)
@@ -368,6 +370,7 @@ class StatusLine:
         """Show what is known of what is wanted; called by one thread after the other."""
         known, below = verdict(progress), ""
         text, severity = known.reason, known.severity
+        self.judgement = line_html(known) + place_html(text, COLOURS[severity][0], REASON)
         if progress.message is not None:
             text, severity = progress.message.text, progress.message.severity
         if progress.learning is not None:
