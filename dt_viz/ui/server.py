@@ -35,9 +35,9 @@ logger = logging.getLogger(__name__)
 MAX_WAITING = 8
 """Largest number of visitors who wait for a place, unless it is chosen."""
 IDLE = 600.0
-"""Time after which a visitor who does nothing gives his place to one who waits, seconds."""
+"""Time after which the arm of a visitor who does nothing rests, and he gives his place to one who waits, seconds."""
 NEGLECTED = 30.0
-"""Time after which the arm of a page that nobody touches rests where many are here, seconds."""
+"""Time after which his arm rests where many are here, seconds."""
 LEAVING = "Others wait for a place, and you have done nothing for a while: you are in line again."
 """What he is told."""
 CLOSING = "The server ends. This page opens again by itself when it is back."
@@ -133,12 +133,13 @@ class Server:
     def attend(self) -> None:
         """See to those who wait, as a place may be free in another process, and to those who do nothing.
 
-        Where there are more visitors than cores, their arms rest; where others wait, the quietest gives his place.
+        The arms of those who do nothing rest, and soon where visitors are more than cores; where others wait, the
+        quietest gives his place.
         """
         self._admit()
         many = len(self.visitors) > (os.cpu_count() or 1)
         for visitor in self.visitors:
-            visitor.robot.playback.neglected = many and self.gate.idle(visitor.client) > NEGLECTED
+            visitor.robot.playback.neglected = self.gate.idle(visitor.client) > (NEGLECTED if many else IDLE)
         with self._lock:
             for _, said, came in self._waiting.values():
                 if said is not None:

@@ -306,16 +306,23 @@ async def test_who_does_nothing_gives_his_place_to_one_who_waits_and_only_then(u
 
 
 @asynchronous
-@pytest.mark.parametrize(("num_cores", "expected"), [(1, [True, False]), (2, [False, False])])
-async def test_where_many_are_here_the_arm_of_a_page_that_nobody_touches_rests(
-    url, server, monkeypatch, num_cores, expected
+@pytest.mark.parametrize(
+    ("num_cores", "seconds", "expected"),
+    [
+        (1, 2 * server_module.NEGLECTED, [True, False]),
+        (2, 2 * server_module.NEGLECTED, [False, False]),
+        (2, 2 * server_module.IDLE, [True, False]),
+    ],
+)
+async def test_the_arm_of_a_page_that_nobody_touches_rests_and_soon_where_many_are_here(
+    url, server, monkeypatch, num_cores, seconds, expected
 ):
     monkeypatch.setattr(server_module.os, "cpu_count", lambda: num_cores)
     async with Client(url) as idle, Client(url) as busy:
         for client in (idle, busy):
             await client.look()
             assert await client.wait_for(lambda c=client: c.has_picture, PATIENCE)
-        grow_idle(server, 2 * server_module.NEGLECTED)
+        grow_idle(server, seconds)
         await busy.look()
         assert await answers(busy)
         server.attend()
