@@ -162,6 +162,13 @@ def press(locator):
     locator.click(force=True)
 
 
+def travel(page, name):
+    """Press a button of the history once the page has been told that there is such a step."""
+    button = page.get_by_role("button", name=name, exact=True)
+    wait_until(lambda: button.evaluate("node => getComputedStyle(node).pointerEvents") == "auto", f"a step to {name}")
+    press(button)
+
+
 def open_tab(page, name):
     """A tab of the panel."""
     press(page.get_by_role("tab", name=name, exact=True))

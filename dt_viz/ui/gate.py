@@ -241,7 +241,7 @@ class Gate:
         if connection is None:
             return ""
         headers = connection.request.headers
-        return headers.get("Origin") or f"http://{headers['Host']}"
+        return headers.get("Origin") or f"http://{headers.get('Host', '')}"
 
     def idle(self, client: viser.ClientHandle) -> float:
         """Return the time since a client sent something, seconds; 0 if it has left."""

@@ -191,9 +191,8 @@ def encode_once() -> None:
     async def produce(websocket: Any, buffer: Any, client_id: int, backlog_done_message: Any = None) -> None:  # noqa: ANN401
         if not buffer.persistent_messages:  # those of one client
             return await original(websocket, buffer, client_id, backlog_done_message)
-        known = vars(buffer).setdefault(
-            "_encoded", OrderedDict()
-        )  # windows, so that their names stay theirs, and bytes
+        # windows, so that their names stay theirs, and bytes
+        known = vars(buffer).setdefault("_encoded", OrderedDict())
         windows = buffer.window_generator(client_id, backlog_done_message=backlog_done_message)
         try:
             async for window in windows:

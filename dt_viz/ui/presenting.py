@@ -233,7 +233,7 @@ class Lecture:
                 self._headline = _line(NOT_YET if self._headline == _line(NOT_YET) else AWAY)
             elif presenter.visitor is not None:
                 self._headline = presenter.visitor.headline
-                if (label := f"DT-Viz · {len(watching)} watch") != presenter.label:
+                if (label := f"DT-Viz · {len(watching)} watching") != presenter.label:
                     presenter.label = label
                     presenter.client.gui.set_panel_label(label)
             for viewer in watching:

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from browsing import LIGHT, PATIENCE, close_page, open_page, open_tab, press, wait_until
+from browsing import LIGHT, PATIENCE, close_page, open_page, open_tab, press, travel, wait_until
 from chromium import needs_chromium
 from other_arms import seven_joints
 from playwright.sync_api import expect
@@ -46,9 +46,9 @@ def test_the_arm_changes_in_place_and_back_for_its_visitor_alone(browser, server
         hand = visitor.robot.hand
         visitor.session.step("play", view=replace(visitor.session.scenario.view, playing=True))
         wait_until(lambda: not np.array_equal(visitor.robot.hand, hand), "the hand to move")
-        press(page.get_by_role("button", name="Undo"))
+        travel(page, "Undo")
         wait_until(lambda: is_shown(visitor, "", 6), "the arm as before")
-        press(page.get_by_role("button", name="Redo"))
+        travel(page, "Redo")
         wait_until(lambda: is_shown(visitor, "panda", 7), "the other arm again")
         choose(page, "JACO", instead_of="Franka Panda")
         wait_until(lambda: is_shown(visitor, "", 6), "the arm as it was")

@@ -1,7 +1,7 @@
 """A visitor's own recordings in a real browser: several files are chosen at once, or dropped, seen, and learned."""
 
 import pytest
-from browsing import PATIENCE, close_notices, close_page, open_page, press, take, wait_until
+from browsing import PATIENCE, close_notices, close_page, open_page, press, take, travel, wait_until
 from chromium import needs_chromium
 
 pytestmark = [pytest.mark.browser, needs_chromium]
@@ -32,5 +32,5 @@ def test_six_files_chosen_at_once_are_seen_and_learned_by_a_click_and_undo_goes_
     wait_until(lambda: not takes.visible, "the learned motion in place of the takes")
     assert visitor.session.wait_idle(PATIENCE)
     assert page.get_by_role("textbox", name="Task").count() or page.locator("input[value='Your data']").count()
-    press(page.get_by_role("button", name="Undo", exact=True))
+    travel(page, "Undo")
     wait_until(lambda: visitor.shown is not None and visitor.shown.scenario.task == "draw_s", "the task before")

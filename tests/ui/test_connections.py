@@ -192,7 +192,7 @@ async def test_prometheus_is_told_what_visitors_do_and_nobody_is_under_a_foreign
     _, refused = await asyncio.to_thread(told_to_prometheus, server)
     assert status == 200 and before["dt_viz_visitors"] == 0 and after["dt_viz_visitors"] == 1
     grown = {name: after[f"dt_viz_{name}"] - before[f"dt_viz_{name}"] for name in ("edits_total", "frames_total")}
-    assert 6 <= grown["edits_total"] <= 8 and 2 <= grown["frames_total"] <= grown["edits_total"]
+    assert 6 <= grown["edits_total"] < 12 and 2 <= grown["frames_total"] <= grown["edits_total"]
     assert after["dt_viz_latency_seconds_sum"] > before["dt_viz_latency_seconds_sum"]
     assert refused["dt_viz_refused_requests_total"] == after["dt_viz_refused_requests_total"] + 1
 

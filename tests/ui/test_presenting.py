@@ -41,11 +41,19 @@ def asynchronous(test):
     return run
 
 
+@contextlib.contextmanager
+def served(fits):
+    server = Server(TASKS, fits, load_jaco(), task="draw_s", port=0, max_sessions=PLACES, key=KEY)
+    try:
+        yield server
+    finally:
+        server.close()
+
+
 @pytest.fixture(scope="module")
 def server(fits):
-    server = Server(TASKS, fits, load_jaco(), task="draw_s", port=0, max_sessions=PLACES, key=KEY)
-    yield server
-    server.close()
+    with served(fits) as server:
+        yield server
 
 
 @pytest.fixture
@@ -132,21 +140,26 @@ def same(one, other):
 
 
 @asynchronous
+async def test_before_anybody_presents_viewers_are_told_so(fits):
+    with served(fits) as server:
+        async with watching(f"ws://127.0.0.1:{server.port}") as early:
+            assert early.says(NOT_YET) and not early.has_picture
+
+
+@asynchronous
 async def test_viewers_see_what_the_presenter_draws_early_or_late(url, server):
-    async with watching(url) as early:
-        assert early.says(NOT_YET) and not early.has_picture
-        async with presenting_at(url) as presenter:
-            await presenter.set("Pause", True)
-            await moved_to(presenter, (0.12, -0.5, 0.4))
-            assert await early.wait_for(lambda: stands_at(early, (0.12, -0.5, 0.4)), PATIENCE)
-            assert await early.wait_for(lambda: early.says("✓ safe"), PATIENCE)
-            assert np.ptp(early.nodes[ROLLOUT]["vertices"]) > 0
-            async with watching(url) as late:
-                assert await late.wait_for(lambda: same(early, late), 10)
-                mine, theirs = presenter.nodes[ROLLOUT]["vertices"], late.nodes[ROLLOUT]["vertices"]
-                assert np.array_equal(mine, theirs)
-                assert early.says("Draw S") and late.says("Draw S")
-                assert not late.gizmo and presenter.gizmo
+    async with watching(url) as early, presenting_at(url) as presenter:
+        await presenter.set("Pause", True)
+        await moved_to(presenter, (0.12, -0.5, 0.4))
+        assert await early.wait_for(lambda: stands_at(early, (0.12, -0.5, 0.4)), PATIENCE)
+        assert await early.wait_for(lambda: early.says("✓ safe"), PATIENCE)
+        assert np.ptp(early.nodes[ROLLOUT]["vertices"]) > 0
+        async with watching(url) as late:
+            assert await late.wait_for(lambda: same(early, late), 10)
+            mine, theirs = presenter.nodes[ROLLOUT]["vertices"], late.nodes[ROLLOUT]["vertices"]
+            assert np.array_equal(mine, theirs)
+            assert early.says("Draw S") and late.says("Draw S")
+            assert not late.gizmo and presenter.gizmo
 
 
 @asynchronous
