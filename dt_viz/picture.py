@@ -212,8 +212,8 @@ def _rendered(
             frame = visitor.shown
             if frame is None or frame.stage is not Stage.CERTIFIED:
                 raise TimeoutError(f"the page shows no motion of {task}")
-            replay = visitor.robot.playback.replay
-            replay.seek(SETTINGS.along * replay.duration)
+            if frame.arm is not None:
+                visitor.robot.playback.live.put(frame.arm.q[round(SETTINGS.along * (len(frame.arm.q) - 1))])
             least = SETTINGS.smallest
             visitor.render_alone((least, least), SETTINGS.patience)  # the browser then has all that was sent
             time.sleep(SETTINGS.drawing)
@@ -225,8 +225,8 @@ def _rendered(
 
 
 def _at_rest(scenario: Scenario) -> Scenario:
-    """The scenario, its arm where the replay is held."""
-    return replace(scenario, view=replace(scenario.view, replay=True))
+    """The scenario, its arm where it is put."""
+    return replace(scenario, view=replace(scenario.view, playing=False))
 
 
 @contextmanager
