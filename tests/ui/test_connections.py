@@ -324,6 +324,7 @@ async def test_the_arm_of_a_page_that_nobody_touches_rests_and_soon_where_many_a
         for client in (idle, busy):
             await client.look()
             assert await client.wait_for(lambda c=client: c.has_picture, PATIENCE)
+        found = None
         for _ in range(5):  # a page may still answer by itself, which counts as its visitor's
             grow_idle(server, seconds)
             await busy.look()
