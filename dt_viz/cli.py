@@ -106,7 +106,7 @@ def _serve(options: argparse.Namespace) -> int:
         address = f"http://{host}:{listening.getsockname()[1]}"
         print(f"DT-Viz is at {address} (Ctrl-C stops it)", flush=True)
         if key is not None:
-            print(f"Who presents is at {address}/?present={key}; all others watch", flush=True)
+            print(f"To present, open {address}/?present={key}; all others watch", flush=True)
 
     key = secrets.token_urlsafe(16) if options.present else None
     max_sessions = options.max_sessions or (MAX_WATCHING if options.present else MAX_SESSIONS)

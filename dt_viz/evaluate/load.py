@@ -89,6 +89,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run the command; 1 if a visitor had no picture in time, was lost, or was not shown its last edit."""
+    if options.present and options.url is not None:
+        raise FormatError("--present", "with --url", "without it: the key is that of a server that is started here")
     _, task = chosen_task(options)
     out = None if options.out is None else ready_to_write(options.out, "FILE.json")
     unit = unit_ms()

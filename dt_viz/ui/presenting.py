@@ -77,6 +77,7 @@ class Viewer:
     follow: Control | None = None
     """Whether the camera follows the presenter's."""
     qr: viser.GuiHtmlHandle | None = None
+    """Address of the page, with its QR code."""
     seen: tuple[Pose, Framing] | None = None
     """What the camera was put to last; None where it is to be put again."""
 

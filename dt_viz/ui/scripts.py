@@ -195,7 +195,7 @@ class Ruler:
 
     @property
     def asking_html(self) -> str:
-        """What is to stand on the page of who watches, or has the key: what else a link asks for is left in it."""
+        """HTML that measures the window and tells the presenter's key; the rest of the page's link stays in the address."""
         return self._measures(()) + _run(PRESENT.replace("ADDRESS", f"{FOLDER}/{self.token}"))
 
     def _measures(self, kinds: Sequence[str]) -> str:
@@ -232,7 +232,7 @@ def arrows_html(back: str, following: str) -> str:
 
 
 def forget_html() -> str:
-    """Return what is to stand on the page, unseen, of who is the presenter no longer."""
+    """Return HTML that makes the tab of a former presenter forget the key."""
     return _run(FORGET)
 
 

@@ -37,7 +37,7 @@ MAX_WAITING = 8
 IDLE = 600.0
 """Time after which the arm of a visitor who does nothing rests, and he gives his place to one who waits, seconds."""
 NEGLECTED = 30.0
-"""Time after which his arm rests where many are here, seconds."""
+"""Time after which the arm of a visitor who does nothing rests where visitors are more than cores, seconds."""
 LEAVING = "Others wait for a place, and you have done nothing for a while: you are in line again."
 """What he is told."""
 CLOSING = "The server ends. This page opens again by itself when it is back."

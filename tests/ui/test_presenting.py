@@ -8,17 +8,22 @@ import time
 import urllib.error
 import urllib.request
 import warnings
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from pages import wait_until
+from viser._messages import SetPositionMessage  # noqa: TID251
+from viser.infra import _infra  # noqa: TID251
 
 from dt_viz.evaluate.protocol_client import OBSTACLE, ROLLOUT, LostError, ProtocolClient
 from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.scenario import OFFERS
 from dt_viz.scenario.tasks import TASKS
-from dt_viz.ui import presenting
+from dt_viz.ui import patches, presenting
 from dt_viz.ui.keeping import KEY as KEPT
+from dt_viz.ui.patches import NUM_ENCODED
 from dt_viz.ui.presenting import AWAY, CARD, NOT_YET, OWN_MACHINE, TAKEN, WRONG, reachable
 from dt_viz.ui.scene.camera import Framing, followed
 from dt_viz.ui.server import Server
@@ -343,3 +348,38 @@ async def test_the_presenter_gets_in_where_all_places_are_taken_and_health_count
         assert not late.says("places are taken")
         assert {"visitors": PLACES + 1, "waiting": 0}.items() <= health().items()
         assert late.says(OWN_MACHINE)
+
+
+def test_a_window_of_messages_is_encoded_once_for_all_and_as_viser_does(monkeypatch):
+    patches.encode_once()
+    monkeypatch.setattr(time, "perf_counter", lambda: 0.0)  # each window tells when it is encoded
+    produce: Any = _infra._message_producer
+
+    def windows():
+        return ([SetPositionMessage(f"/{k}", (float(k), 0.0, 0.0))] for k in range(3 * NUM_ENCODED))
+
+    shared = list(windows())
+
+    def sent(given, *, persistent):
+        """What a client is sent of windows of messages, each with the same ones in a list of its own."""
+
+        async def window_generator(_client_id, backlog_done_message=None):
+            for window in given:
+                yield list(window)
+
+        async def send(raw):
+            raws.append(raw)
+
+        raws = []
+        buffer.persistent_messages, buffer.window_generator = persistent, window_generator
+        asyncio.run(produce(SimpleNamespace(send=send), buffer, 0))
+        return raws
+
+    buffer = SimpleNamespace(done=False)
+    one, other = (sent(shared[:NUM_ENCODED], persistent=True) for _ in range(2))
+    assert len(one) == NUM_ENCODED and all(mine is theirs for mine, theirs in zip(one, other, strict=True))
+    assert one == sent(shared[:NUM_ENCODED], persistent=False)
+    assert sent(shared, persistent=True) == sent(shared, persistent=False)
+    assert sent(shared[:3], persistent=True) == one[:3]  # those are kept no longer
+    assert sent(windows(), persistent=True) == sent(shared, persistent=False)  # messages that are gone have no name
+    assert len(buffer._encoded) == NUM_ENCODED
