@@ -195,7 +195,7 @@ class Ruler:
 
     @property
     def asking_html(self) -> str:
-        """HTML that measures the window and tells the presenter's key; the rest of the page's link stays in the address."""
+        """HTML that measures the window and tells the presenter's key; the rest of the link stays in the address."""
         return self._measures(()) + _run(PRESENT.replace("ADDRESS", f"{FOLDER}/{self.token}"))
 
     def _measures(self, kinds: Sequence[str]) -> str:
