@@ -10,7 +10,7 @@ from typing import Any
 import viser
 
 from dt_viz.avoidance.avoidance import Space
-from dt_viz.errors import FormatError
+from dt_viz.errors import Cancelled, FormatError
 from dt_viz.robot.placement import is_jaco
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.paper_scenes import SCENES, PaperScene, found, offered
@@ -73,7 +73,7 @@ class ControlPanel:
         titles: Mapping[str, str],
         robot: Robot,
         arms: Mapping[str, str],
-        render: Callable[[str, bool], bytes],
+        render: Callable[[str, bool, Cancelled], bytes],
         send: Callable[[str, bytes], None],
         notify: Callable[[str, Colour], None],
         tripod: CameraController,

@@ -13,7 +13,7 @@ import numpy as np
 import viser
 
 from dt_viz.accounts import Account
-from dt_viz.errors import Cancelled, DataError, FormatError, end_if
+from dt_viz.errors import Cancelled, DataError, FormatError, end_if, never
 from dt_viz.files.uploads import keep_ready, let_go
 from dt_viz.obstacles.shapes import Sphere, TriangleObstacle, as_point
 from dt_viz.pictures.video import check_installed
@@ -40,7 +40,7 @@ from dt_viz.ui.panel import ControlPanel
 from dt_viz.ui.pen import Pen
 from dt_viz.ui.playback import Playback, Replay
 from dt_viz.ui.scene.camera import CameraController, Framing, Pose, shot_of, view_of
-from dt_viz.ui.scene.export import RESOLUTIONS, render_frame, render_png
+from dt_viz.ui.scene.export import RESOLUTIONS, TIMEOUT, render_frame, render_png
 from dt_viz.ui.scene.film import MOTION, SETTINGS, TURNTABLE, Film, Rendering, encoded, motion, turntable, warping
 from dt_viz.ui.scene.key import Key
 from dt_viz.ui.scene.legend import Legend, legend_in
@@ -49,6 +49,7 @@ from dt_viz.ui.scene.recording import record
 from dt_viz.ui.scene.robot_scene import RobotScene
 from dt_viz.ui.scene.scene import ScenePictures
 from dt_viz.ui.scene.studio import Studio
+from dt_viz.ui.scene.waiting import BROWSER, LOOK, Worker
 from dt_viz.ui.scripts import Link, Ruler
 from dt_viz.ui.tabs.saving import Step
 from dt_viz.warning import Severity
@@ -123,7 +124,9 @@ class Visitor(Display):
             titles,
             robot,
             titled,
-            lambda resolution, transparent: self.render(RESOLUTIONS[resolution], transparent=transparent),
+            lambda resolution, transparent, cancelled: self.render(
+                RESOLUTIONS[resolution], transparent=transparent, cancelled=cancelled
+            ),
             self._send,
             partial(notify, client),
             self._camera,
@@ -323,10 +326,18 @@ class Visitor(Display):
         self._dress(self._studio.theme)
         self._studio.paint()
 
-    def render(self, size: tuple[int, int], *, transparent: bool = False) -> bytes:
-        """Render the scene as the visitor sees it, as a PNG of a width and height in pixels; see `render_png`."""
-        with self._studio.rendering():
-            return render_png(self.client, size, self._camera.shot(size), self._legends, transparent=transparent)
+    def render(self, size: tuple[int, int], *, transparent: bool = False, cancelled: Cancelled = never) -> bytes:
+        """Render the scene as the visitor sees it, as a PNG of a width and height in pixels; see `render_png`.
+
+        Raises:
+            TimeoutError: the browser does not answer.
+            UnwantedError: it is cancelled; the browser is not waited for.
+        """
+        with self._studio.rendering(), Worker(cancelled, TIMEOUT) as worker:
+            shot, legends = self._camera.shot(size), self._legends
+            return worker.done(
+                lambda: render_png(self.client, size, shot, legends, 2 * TIMEOUT, transparent=transparent), BROWSER
+            )
 
     def render_alone(self, size: tuple[int, int], timeout: float) -> bytes:
         """Render the scene that is shown as `render` does, but framed in all of the picture; `timeout` in seconds."""
@@ -334,7 +345,7 @@ class Visitor(Display):
         self.client.flush()
         with self._studio.rendering():
             shot = shot_of(self._pose_alone(size))
-            return render_png(self.client, size, shot, self._legends, transparent=False, timeout=timeout)
+            return render_png(self.client, size, shot, self._legends, timeout, transparent=False)
 
     def _pose_alone(self, size: tuple[int, int]) -> Pose:
         """Pose of a camera that frames what is shown in all of a picture of a width and height in pixels."""
@@ -369,7 +380,7 @@ class Visitor(Display):
         """
         check_installed()
         deadline = time.monotonic() + SETTINGS.patience
-        while not self.session.wait_idle(SETTINGS.look):
+        while not self.session.wait_idle(LOOK):
             step(0.0)
             if time.monotonic() > deadline:
                 raise TimeoutError(f"the scene was not at rest within {SETTINGS.patience:g} s")

@@ -3,6 +3,7 @@
 import io
 import re
 import threading
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 import yaml
 from pages import Page, wait_until
 from PIL import Image
+from viser._gui_handles import GuiProgressBarHandle  # noqa: TID251
 
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.session.frame import Stage
@@ -42,6 +44,12 @@ def press(page, label):
     assert page.session.jobs.wait_idle(label, 60)
     message = page.session._screen.progress.message
     return list(page.sent), "" if message is None else message.text
+
+
+def bars(page):
+    """Progress bars that are seen."""
+    handles = page.gui._gui_input_handle_from_uuid.values()
+    return [handle for handle in handles if isinstance(handle, GuiProgressBarHandle) and handle.visible]
 
 
 def shown(page, frame):
@@ -125,13 +133,48 @@ def test_a_second_press_cancels_and_the_button_comes_back(saving, frame, monkeyp
     button = saving["Save picture"]
     saving.claim(button, True)
     assert began.wait(30)
-    assert button.label == "Cancel"
+    assert button.label == "Cancel" and [one.value for one in bars(saving)] == [20]
     assert saving.gui._thread_executor.submit(lambda: True).result(timeout=20)  # nobody else waits for it
     saving.claim(button, True)
     goes_on.set()
     wait_until(lambda: button.label == "Save picture")
-    assert saving.session.jobs.wait_idle("Save picture", 30) and not saving.sent
+    assert saving.session.jobs.wait_idle("Save picture", 30) and not saving.sent and not bars(saving)
     saving.claim(saving["Save as"], "PNG")
+
+
+def test_a_png_is_cancelled_at_once_though_the_browser_is_busy(saving, frame, monkeypatch):
+    asked, answers = threading.Event(), threading.Event()
+
+    def render(*_size, **_how):
+        asked.set()
+        assert answers.wait(30)
+        return np.zeros((2, 2, 4), np.uint8)
+
+    monkeypatch.setattr(saving.client, "get_render", render)
+    shown(saving, frame)
+    saving.sent.clear()
+    button, handles = saving["Save picture"], {name: gizmo.opacity for name, gizmo in saving.gizmos.items()}
+    saving.claim(button, True)
+    assert asked.wait(30)
+    assert button.label == "Cancel" and not bars(saving)  # nobody knows how far the browser is
+    pressed = time.monotonic()
+    saving.claim(button, True)
+    assert saving.session.jobs.wait_idle("Save picture", 10) and time.monotonic() - pressed < 1.0
+    assert button.label == "Save picture" and not saving.sent
+    assert {name: gizmo.opacity for name, gizmo in saving.gizmos.items()} == handles
+    answers.set()
+    ((name, _),), _ = press(saving, "Save picture")
+    assert name == "dt-viz-draw_s.png"
+
+
+def test_a_browser_that_gives_no_png_is_told_of_in_a_line(saving, frame, monkeypatch):
+    answers = threading.Event()
+    monkeypatch.setattr("dt_viz.ui.visitor.TIMEOUT", 0.2)
+    monkeypatch.setattr(saving.client, "get_render", lambda *_size, **_how: answers.wait(30))
+    shown(saving, frame)
+    sent, said = press(saving, "Save picture")
+    answers.set()
+    assert not sent and said.startswith("Save picture: the browser, its page out of sight perhaps, drew nothing")
 
 
 def texts(svg):

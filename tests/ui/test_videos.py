@@ -261,7 +261,7 @@ def test_what_goes_wrong_is_said_in_a_line_and_nothing_stays(filming, frame, why
         for module in ("visitor", "scene.film"):
             monkeypatch.setattr(f"dt_viz.ui.{module}.SETTINGS", short)
         browser.goes_on.clear()
-        said = "Save video: the browser, its page out of sight perhaps, drew no frame within 0.3 s"
+        said = "Save video: the browser, its page out of sight perhaps, drew nothing within 0.3 s"
     elif why == "another size":
         browser.size = 8, 8
         said = "Save video: the browser: found a picture of shape (8, 8, 4); accepted: 1280x720 pixels"

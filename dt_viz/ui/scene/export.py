@@ -23,7 +23,7 @@ RESOLUTIONS = {
 }
 """Width and height in pixels, by name."""
 TIMEOUT = 60.0
-"""Longest time to wait for the browser, seconds."""
+"""Longest time to wait for the browser with a PNG, seconds."""
 
 
 def render_png(
@@ -31,9 +31,9 @@ def render_png(
     size: tuple[int, int],
     shot: Shot,
     legends: Sequence[Legend | Key],
+    timeout: float,
     *,
     transparent: bool,
-    timeout: float = TIMEOUT,
 ) -> bytes:
     """Render the scene of a visitor as a PNG file.
 
@@ -42,8 +42,8 @@ def render_png(
         size: width and height, pixels.
         shot: camera of the picture.
         legends: what explains its colours, drawn onto it.
-        transparent: keep the background transparent, else make it white.
         timeout: longest time to wait for the browser, seconds.
+        transparent: keep the background transparent, else make it white.
 
     Raises:
         TimeoutError: the browser did not answer.

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import partial
-from time import monotonic, thread_time
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dt_viz.accounts import settle
 from dt_viz.errors import Cancelled, end_if
 from dt_viz.flows.fields import Array
 from dt_viz.pictures.video import Encoder
@@ -20,11 +17,10 @@ from dt_viz.ui.playback import Replay
 from dt_viz.ui.scene.camera import Shot, turned_shot
 from dt_viz.ui.scene.key import Key
 from dt_viz.ui.scene.legend import Legend
+from dt_viz.ui.scene.waiting import BROWSER, Worker
 
 MOTION, TURNTABLE, WARP = "Motion", "Turntable", "Warp"
 """What videos show: the finished motion, the scene from all around, and the warp of the stack."""
-
-_Result = TypeVar("_Result")
 
 
 @dataclass(frozen=True)
@@ -45,8 +41,6 @@ class FilmSettings:
     """Part of its motion at which the arm is shown while the warp runs."""
     patience: float = 20.0
     """Longest time to wait for the browser, or for ffmpeg, with each frame."""
-    look: float = 0.1
-    """Interval at which what waits asks whether the video is still wanted."""
 
 
 SETTINGS = FilmSettings()
@@ -132,41 +126,13 @@ def encoded(
         TimeoutError: the browser, or ffmpeg, does not answer.
         UnwantedError: it is cancelled.
     """
-    pool = ThreadPoolExecutor(1, "film")
-
-    def done(work: Callable[[], _Result], failed: str) -> _Result:
-        result, seconds = _waited(pool.submit(_timed, work), failed, cancelled)
-        settle(seconds)
-        return result
-
-    try:
-        with Encoder(suffix, size, SETTINGS.rate) as encoder:
-            frame = np.zeros((size[1], size[0], 3), np.uint8)
-            for k, part in enumerate(film.parts.tolist()):
-                end_if(cancelled)
-                frame = done(
-                    partial(render, film.show(part)), "the browser, its page out of sight perhaps, drew no frame"
-                )
-                done(partial(encoder.write, frame), "ffmpeg took no frame")
-                step((k + 1) / (len(film.parts) + 1))
-            for _ in range(round(SETTINGS.rest * SETTINGS.rate) if film.rests else 0):
-                done(partial(encoder.write, frame), "ffmpeg took no frame")
-            return done(encoder.finish, "ffmpeg wrote no file")
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
-
-
-def _timed(work: Callable[[], _Result]) -> tuple[_Result, float]:
-    """Return what work returns, and the processor time that it takes, seconds."""
-    began = thread_time()
-    return work(), thread_time() - began
-
-
-def _waited(future: Future[_Result], failed: str, cancelled: Cancelled) -> _Result:
-    """Wait for work on another thread; what is cancelled is not waited for."""
-    deadline = monotonic() + SETTINGS.patience
-    while not wait([future], SETTINGS.look).done:
-        end_if(cancelled)
-        if monotonic() > deadline:
-            raise TimeoutError(f"{failed} within {SETTINGS.patience:g} s")
-    return future.result()
+    with Worker(cancelled, SETTINGS.patience) as worker, Encoder(suffix, size, SETTINGS.rate) as encoder:
+        frame = np.zeros((size[1], size[0], 3), np.uint8)
+        for k, part in enumerate(film.parts.tolist()):
+            end_if(cancelled)
+            frame = worker.done(partial(render, film.show(part)), BROWSER)
+            worker.done(partial(encoder.write, frame), "ffmpeg took no frame")
+            step((k + 1) / (len(film.parts) + 1))
+        for _ in range(round(SETTINGS.rest * SETTINGS.rate) if film.rests else 0):
+            worker.done(partial(encoder.write, frame), "ffmpeg took no frame")
+        return worker.done(encoder.finish, "ffmpeg wrote no file")

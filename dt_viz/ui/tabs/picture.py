@@ -65,7 +65,7 @@ class PictureTab:
         *,
         darken: Callable[[bool], None],
         enlarge: Callable[[bool], None],
-        render: Callable[[str, bool], bytes],
+        render: Callable[[str, bool, Cancelled], bytes],
         draw: Callable[[str, Step], bytes],
         record: Callable[[Step], bytes],
         film: Film,
@@ -108,7 +108,7 @@ class PictureTab:
 
         def make(session: Session, step: Step, cancelled: Cancelled) -> tuple[str, bytes]:
             if self._format.value == PNG:
-                return ".png", render(self._resolution.value, self._transparent.value)
+                return ".png", render(self._resolution.value, self._transparent.value, cancelled)
             suffix = f".{self._format.value.lower()}"
             if self._format.value in VIDEOS:
                 return suffix, film(self._what.value, suffix, self._resolution.value, step, cancelled)

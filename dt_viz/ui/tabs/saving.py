@@ -20,7 +20,10 @@ Make = Callable[[Session, Step, Cancelled], tuple[str, bytes]]
 
 
 class SaveButton:
-    """A button that makes and sends one file at a time; while it does so, it is the one that cancels that."""
+    """A button that makes and sends one file at a time; while it does so, it is the one that cancels that.
+
+    A bar below it shows progress, once a file's maker has told any.
+    """
 
     def __init__(
         self,
@@ -57,12 +60,12 @@ class SaveButton:
 
         def step(fraction: float) -> None:
             end_if(cancelled)
-            self._bar.value = 100 * fraction
+            self._bar.value, self._bar.visible = 100 * fraction, True
 
-        label, self.button.label, self._bar.visible = self._label, CANCEL, True
+        label, self.button.label = self._label, CANCEL
         try:
             suffix, content = self._make(session, step, cancelled)
-            step(1.0)
+            end_if(cancelled)
             self._send(suffix, content)
         except (FormatError, TimeoutError) as error:
             session.say(f"{label}: {error}", Severity.WARNING)
