@@ -268,11 +268,13 @@ def test_plots_have_a_curve_for_each_method_that_moves(server, beside):
     _, _, frames = beside
     panel = ComparePanel(server.gui, Bindings(), lambda _suffix, _content: None)
     panel.draw(frames[1].comparison)
-    assert [len(plot.data) for plot in panel.plots] == [3, 3]  # the slow one is not there yet
+    plots = [plot for both in panel.plots for plot in both]
+    assert [len(plot.data) for plot in plots] == [3] * 4  # the slow one is not there yet
     panel.draw(frames[-1].comparison)
-    assert [len(plot.data) for plot in panel.plots] == [len(plot.series) for plot in panel.plots] == [4, 4]
+    assert [len(plot.data) for plot in plots] == [len(plot.series) for plot in plots] == [4] * 4
+    np.testing.assert_array_equal(*(both[1].data for both in panel.plots))
     panel.draw(())
-    assert len(panel.plots[0].data) == 4
+    assert len(plots[0].data) == 4
     server.gui.reset()
 
 

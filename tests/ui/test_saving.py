@@ -15,7 +15,9 @@ from viser._gui_handles import GuiProgressBarHandle  # noqa: TID251
 
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.session.frame import Stage
+from dt_viz.ui.scene import figure
 from dt_viz.ui.scene.figure import SUFFIXES, render_figure
+from dt_viz.ui.scene.picture import Look
 from dt_viz.warning import ARM, Kind, MotionWarning
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of matplotlib's own parts
@@ -198,9 +200,30 @@ class TestFigure:
         svg = render_figure(at_rest(scenario, Stage.FINE), ".svg")
         assert b"#d55e00" in svg and b"#cc79a7" in svg
 
-    def test_an_outline_is_where_the_obstacle_is(self, frame):
-        from dt_viz.ui.scene import figure
+    def test_compared_methods_are_drawn_and_named_as_in_the_scene(self, at_rest, initial, saving):
+        scenario = initial("draw_s")
+        view = replace(scenario.view, compared=("linear", "modulation"))
+        frame = at_rest(replace(scenario, view=view), Stage.FINE)
+        picture = saving.visitor.pictures.layer("compared")
+        picture.draw(frame, Look())
+        picture.visible = True
+        drawn = figure._scene(frame, "")
+        in_scene = {(name, figure._hex(colour)) for name, colour in picture.key.lines}
+        assert len(in_scene) == 3 and in_scene <= {(part.label, part.colour) for part in drawn.strokes}
+        assert {name for name, _ in in_scene} <= set(texts(render_figure(frame, ".svg")))
+        for motions in picture.motions.values():
+            for lines in (motions.followed, motions.others):
+                colour = figure._hex(tuple(lines.node.colors))
+                (part,) = (
+                    part for part in drawn.strokes if (part.colour, part.width) == (colour, lines.node.thickness)
+                )
+                places = np.concatenate([np.stack([path[:-1], path[1:]], axis=1) for path in part.paths])
+                plane = figure._Plane.of(frame.slice, frame)
+                off = places - plane.across(np.asarray(lines.node.points, float))
+                np.testing.assert_allclose(off, np.broadcast_to(off[0, 0], off.shape), atol=1e-6)  # another middle
+                assert (places >= drawn.lower - 1e-9).all() and (places <= drawn.upper + 1e-9).all()
 
+    def test_an_outline_is_where_the_obstacle_is(self, frame):
         (sphere,) = frame.scenario.obstacles
         drawn = figure._scene(frame, "")
         (body,) = drawn.levels
@@ -213,8 +236,6 @@ class TestFigure:
 
     def test_level_lines_lie_where_the_function_has_their_value(self, at_rest, initial):
         """The goal, where the Lyapunov value is 0, is where the drawn lattice has its least value."""
-        from dt_viz.ui.scene import figure
-
         scenario = initial("draw_s")
         frame = at_rest(replace(scenario, view=replace(scenario.view, colour="lyapunov")), Stage.FINE)
         drawn = figure._scene(frame, "")

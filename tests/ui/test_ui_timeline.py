@@ -208,6 +208,23 @@ def test_large_plots_are_in_windows_in_place_of_the_tab(watched):
         assert [large for large, shown in zip((False, True), plots.health, strict=True) if shown.visible] == health
 
 
+def test_large_plots_of_compared_methods_are_in_a_window_in_place_of_the_tab(watched):
+    gui, edit = watched.page.gui, watched.page.session.edit
+    boxes = [handle for handle in watched.page.inputs if handle.label == "Large plots"]
+
+    def windows():
+        return [panel._tab_labels for panel in gui._panel_handle_from_uuid.values() if panel.visible]
+
+    for view, seen in (
+        (View(compared=("linear",)), []),
+        (View(compared=("linear",), large_plots=True), [("Along the path (fig. 6)",)]),
+        (View(large_plots=True), []),
+    ):
+        edit("test", view=view)
+        assert windows() == seen
+        assert sum(box.visible for box in boxes) == bool(view.compared)
+
+
 def test_a_place_is_marked_where_the_path_is_nearest():
     path = np.array([[0.0, 0, 0], [1, 0, 0], [1, 3, 0]])
     assert [place_along(path, np.array(place)) for place in ((-1, 0, 0), (1.2, 0.1, 0), (1, 9, 9))] == [0.0, 0.25, 1.0]

@@ -29,6 +29,12 @@ APART = 0.045
 """Height of one name above another, metres."""
 
 
+def followed(frame: Frame) -> dict[str, Compared]:
+    """Return the methods beside ours of which a motion is followed, by their names: those that are seen."""
+    shown = [one for one in frame.comparison if one.method.name in COLOURS and len(one.paths) > one.rollout]
+    return {one.method.name: one for one in shown}
+
+
 class _DrawnMotions:
     """Motions of one method, and its name beside them."""
 
@@ -40,7 +46,7 @@ class _DrawnMotions:
         self.label = add_label(scene, f"{node}/name", title)
 
     def show(self, compared: Compared, ours: Array, names: list[Array], theme: Theme) -> None:
-        """Show motions, with the name where they are farthest from ours.
+        """Show motions, with the name where the one that is followed is farthest from ours.
 
         Args:
             compared: the motions.
@@ -48,16 +54,15 @@ class _DrawnMotions:
             names: places (3,) of other names, metres, which this one is kept clear of; it is appended.
             theme: colours.
         """
-        followed = compared.paths[compared.rollout : compared.rollout + 1]
-        self.followed.show(followed, theme)
+        path = compared.paths[compared.rollout]
+        self.followed.show([path], theme)
         self.others.show(compared.paths[: compared.rollout] + compared.paths[compared.rollout + 1 :], theme)
-        self.node.visible = bool(followed)
-        for path in followed:
-            place = path[np.argmax(distance_from_path(path, ours))] + np.array([0.0, 0.0, 0.012])
-            while any(np.linalg.norm(place - other) < 0.9 * APART for other in names):
-                place = place + np.array([0.0, 0.0, APART])
-            names.append(place)
-            self.label.position = place
+        self.node.visible = True
+        place = path[np.argmax(distance_from_path(path, ours))] + np.array([0.0, 0.0, 0.012])
+        while any(np.linalg.norm(place - other) < 0.9 * APART for other in names):
+            place = place + np.array([0.0, 0.0, APART])
+        names.append(place)
+        self.label.position = place
 
 
 class ComparedMotions(Picture):
@@ -88,7 +93,7 @@ class ComparedMotions(Picture):
                 motions.label.visible = True
 
     def draw(self, frame: Frame, look: Look) -> None:
-        shown = {compared.method.name: compared for compared in frame.comparison if compared.method.name in COLOURS}
+        shown = followed(frame)
         for name in set(self.motions) - set(shown):
             self.motions[name].node.visible = False
         names: list[Array] = []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +18,9 @@ from dt_viz.pictures.panels import PanelPicture
 from dt_viz.pictures.slice_fields import ColourPicture
 from dt_viz.scenario.panels import directions
 from dt_viz.scenario.slices import Slice
-from dt_viz.session.frame import Frame
+from dt_viz.session.comparison import OURS
+from dt_viz.session.frame import Compared, Frame
+from dt_viz.ui.scene.comparison import COLOURS, followed
 from dt_viz.ui.scene.palette import LIGHT, Colour
 from dt_viz.ui.scene.slice_layers import CM2
 from dt_viz.ui.scene.style import STYLES, Style
@@ -53,11 +55,11 @@ class _Plane:
         """Places (*B, 2) of world points (*B, 3), metres."""
         return (points - self.area.centre) @ self.axes
 
-    def strokes(self, label: str, style: Style, paths: Iterable[Array]) -> Strokes:
-        """Paths (T_i, 3), metres; empty ones are left out."""
+    def strokes(self, label: str, style: Style, paths: Iterable[Array], number: int = 0) -> Strokes:
+        """Paths (T_i, 3), metres, in the style's colour of a number; empty ones are left out."""
         seen = [self.across(path) for path in paths if len(path)]
         width, is_directed = style.width or style.radius, style in (STYLES.streamline, STYLES.panel_streamline)
-        return Strokes(label, seen, _hex(style.on(LIGHT)), width, bool(style.dash), is_directed, style.ball > 0)
+        return Strokes(label, seen, _hex(style.on(LIGHT, number)), width, bool(style.dash), is_directed, style.ball > 0)
 
     def segments(self, label: str, style: Style, segments: Array | None) -> Strokes:
         """Segments (K, 2, 3), metres, one after the other where they meet."""
@@ -131,14 +133,17 @@ def _scene(frame: Frame, title: str) -> Drawing:
     own, added = ([path for place, path in rollouts.items() if frame.shaping[place] == own] for own in (True, False))
     demonstrations = frame.task.paths if view.demonstrations else ()
     ghost = [path for place, path in enumerate(frame.ghost) if place == frame.chosen and view.ghost and moves]
-    plane = _Plane.of(frame.slice.holding([*frame.task.paths, *rollouts.values()]), frame)
+    others = followed(frame)
+    beside = [path for compared in others.values() for path in compared.paths]
+    plane = _Plane.of(frame.slice.holding([*frame.task.paths, *rollouts.values(), *beside]), frame)
     strokes = [
         plane.segments("warped grid", STYLES.grid, pictures.grid),
         plane.strokes("streamlines", STYLES.streamline, pictures.streamlines or ()),
         plane.strokes("demonstrations", STYLES.demonstration, demonstrations),
         plane.strokes("undisturbed", STYLES.ghost, ghost),
         plane.strokes("rollouts of the level", STYLES.level, () if frame.level is None else frame.levels[frame.level]),
-        plane.strokes("rollouts", STYLES.rollout, own),
+        *(part for name, compared in others.items() for part in _compared(plane, name, compared)),
+        plane.strokes(OURS.title if others else "rollouts", STYLES.rollout, own),
         plane.strokes("added rollouts", STYLES.added, added),
     ]
     levels = [plane.body(obstacle) for obstacle in frame.scenario.obstacles]
@@ -152,6 +157,14 @@ def _scene(frame: Frame, title: str) -> Drawing:
     points["goal"] = plane.points([frame.goal], LIGHT.goal)
     field = (pictures.field.points, pictures.field.velocities) if moves and pictures.field is not None else None
     return plane.drawing(title, strokes, points, field, STYLES.field, levels)
+
+
+def _compared(plane: _Plane, name: str, compared: Compared) -> Iterator[Strokes]:
+    """The motions of a method beside ours, the one that is named in the scene last."""
+    number, title = list(COLOURS).index(name), compared.method.title
+    for style, is_named in ((STYLES.compared, False), (STYLES.compared_followed, True)):
+        paths = [path for k, path in enumerate(compared.paths) if (k == compared.rollout) == is_named]
+        yield plane.strokes(title, style, paths, number)
 
 
 def _function(area: _Plane, picture: ColourPicture, seen: _Plane) -> Levels:

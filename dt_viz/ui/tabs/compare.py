@@ -23,7 +23,7 @@ from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.comparison import COLOURS
 from dt_viz.ui.scene.palette import css
 from dt_viz.ui.tabs.data import SAVE, curves_table, scores_table, table_csv
-from dt_viz.ui.tabs.plots import add_plot, columns, curve, small
+from dt_viz.ui.tabs.plots import LARGE, add_container, add_plot, columns, curve, small
 
 NONE = "–"
 DEEP = 0.001
@@ -62,13 +62,22 @@ class ComparePanel:
             lambda s: by_name.get(s.view.their_arm, NONE),
             lambda s, title: _with_their_arm(s, titles.get(title, "")),
         )
-        with (folder := gui.add_folder("Along the path (fig. 6)", visible=False)):
-            self.plots = tuple(add_plot(gui, title, "path", _curves(()), 130) for title in TITLES)
+        self.plots: list[tuple[viser.GuiUplotHandle, ...]] = []
+        """One for each of `TITLES`, below the table and in a window."""
+        for large in (False, True):
+            node, content = add_container(gui, "Along the path (fig. 6)", large=large)
+            with content:
+                height = 130 * (LARGE if large else 1)
+                self.plots.append(tuple(add_plot(gui, title, "path", _curves(()), height) for title in TITLES))
+            bindings.properties(
+                node, visible=lambda s, large=large: bool(s.view.compared) and s.view.large_plots == large
+            )
+        compares = lambda s: bool(s.view.compared)  # noqa: E731
+        bindings.checkbox(gui, "large_plots", visible=compares)
         what = "the table, and the curves of the plots, as CSV"
         save = gui.add_button(SAVE, icon=viser.Icon.DOWNLOAD, hint=what, visible=False)
-        bindings.later(save, self._save)
-        for handle in (folder, self.table, save):
-            bindings.properties(handle, visible=lambda s: bool(s.view.compared))
+        bindings.later(save, self._save, visible=compares)
+        bindings.properties(self.table, visible=compares)
 
     def draw(self, comparison: Sequence[Compared]) -> None:
         """Show how methods fare; nothing leaves what is there."""
@@ -80,7 +89,7 @@ class ComparePanel:
         methods = tuple(compared.method for compared in plotted)
         curves = [1e3 * compared.curves for compared in plotted if compared.curves is not None]
         along = np.linspace(0, 1, NUM_SAMPLES)
-        for k, plot in enumerate(self.plots):
+        for k, plot in ((k, plot) for plots in self.plots for k, plot in enumerate(plots)):
             if methods != self._drawn:
                 plot.series = (uplot.Series(label="path"), *_curves(methods))
             plot.data = columns(along, *(curve[:, k] for curve in curves)) if curves else (np.zeros(2),) * 2
