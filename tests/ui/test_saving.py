@@ -204,6 +204,9 @@ class TestFigure:
         scenario = initial("draw_s")
         view = replace(scenario.view, compared=("linear", "modulation"))
         frame = at_rest(replace(scenario, view=view), Stage.FINE)
+        *near, last = frame.comparison
+        far = replace(last, paths=[path + np.array([0.4, 0.0, 0.0]) for path in last.paths])
+        frame = replace(frame, comparison=(*near, far))
         picture = saving.visitor.pictures.layer("compared")
         picture.draw(frame, Look())
         picture.visible = True
