@@ -18,6 +18,7 @@ from tests.benchmarks import __main__ as benchmarks
 ROOT = Path(__file__).parents[1]
 PARTS = ("dt_viz", "assets", "docs")
 DOCUMENTS = [*ROOT.glob("*.md"), *(page for part in PARTS for page in ROOT.glob(f"{part}/**/*.md"))]
+DOCKERFILE = ROOT / "assets/serving/Dockerfile"
 PROGRAMS = {f"{PROG} ": main, f"{benchmarks.PROG} ": benchmarks.main}
 MEASUREMENTS = dict.fromkeys(COMMANDS, evaluate) | dict.fromkeys(benchmarks.NAMES, benchmarks.main)
 """Programs whose names the tables of measurements leave out, by the name of what is measured."""
@@ -76,6 +77,20 @@ def test_quick_commands_make_what_they_say(command, tmp_path, monkeypatch):
     assert main(shlex.split(command)) == 0
     (made,) = tmp_path.iterdir()
     assert command.endswith(f" --out {made.name}") and made.stat().st_size > 10_000
+
+
+def extras(text):
+    """Names of extras that a text says to install."""
+    found = re.findall(r"""["'](?:dt-viz|\.)\[([\w,]+)\]["']|extra `\[(\w+)\]`""", text)
+    return {name for both in found for names in both for name in names.split(",") if name}
+
+
+def test_extras_that_are_told_of_are_the_packages_and_the_container_has_those_of_the_page():
+    project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    (table,) = re.findall(r"^\[project\.optional-dependencies\]\n((?:\w.*\n)+)", project, re.MULTILINE)
+    told = set().union(*(extras(document.read_text(encoding="utf-8")) for document in DOCUMENTS))
+    assert {"data", "video", "docs"} <= told <= set(re.findall(r"^\w+", table, re.MULTILINE))
+    assert extras(DOCKERFILE.read_text(encoding="utf-8")) == {"figures", "video", "metrics", "data"}
 
 
 @pytest.mark.parametrize(

@@ -35,6 +35,8 @@ FIRST = "first"
 """Name of the picture of the first page."""
 DRAWING = 8.0
 """Time that software takes to draw the page, seconds."""
+PATIENCE = 180.0
+"""Longest time to wait for the page, seconds."""
 HIDE_NOTICES = "() => document.querySelectorAll('button.mantine-Notification-closeButton').forEach(b => b.click())"
 
 
@@ -79,7 +81,7 @@ def run(options: argparse.Namespace) -> int:
                 page.evaluate(HIDE_NOTICES)
                 time.sleep(DRAWING)
                 file = options.out / f"{name}.png"
-                page.screenshot(path=file)
+                page.screenshot(path=file, timeout=1000 * PATIENCE)
                 Image.open(file).convert("RGB").quantize(256).save(file, optimize=True)
                 page.close()
                 _until(lambda: not server.visitors)
@@ -121,10 +123,10 @@ def _stop_in_the_middle(visitor: Visitor) -> None:
 
 
 def _until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 180.0
+    deadline = time.monotonic() + PATIENCE
     while not condition():
         if time.monotonic() > deadline:
-            raise TimeoutError("the page was not ready after 180 s")
+            raise TimeoutError(f"the page was not ready after {PATIENCE:g} s")
         time.sleep(0.05)
 
 
