@@ -54,6 +54,9 @@ from dt_viz.ui.scripts import Link, Ruler
 from dt_viz.ui.tabs.saving import Step
 from dt_viz.warning import Severity
 
+BRIEF = 5.0
+"""Time for which a notice lies over the scene whose text stays longer in the status line, seconds."""
+
 
 def initial_scenario(engine: Engine, name: str) -> Scenario:
     """Return the scenario that a task begins with. Raises what `Engine.task` raises."""
@@ -79,9 +82,9 @@ def _sight(pose: Pose | None) -> Sight | None:
     return None if pose is None else (as_point(pose[0]), as_point(pose[1]))
 
 
-def notify(client: viser.ClientHandle, text: str, colour: Colour) -> None:
-    """Show a text in a colour beside the panel of a visitor for a while."""
-    client.add_notification("DT-Viz", text, color=colour, auto_close_seconds=12.0)
+def notify(client: viser.ClientHandle, text: str, colour: Colour, seconds: float = 12.0) -> None:
+    """Show a text in a colour over a corner of a visitor's scene for so long."""
+    client.add_notification("DT-Viz", text, color=colour, auto_close_seconds=seconds)
 
 
 class Visitor(Display):
@@ -128,7 +131,7 @@ class Visitor(Display):
                 RESOLUTIONS[resolution], transparent=transparent, cancelled=cancelled
             ),
             self._send,
-            partial(notify, client),
+            partial(notify, client, seconds=BRIEF),
             self._camera,
             self._darken,
             partial(self._preview, pen),

@@ -24,7 +24,7 @@ from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.jobs import Jobs
-from dt_viz.session.progress import Message, Pace, Progress
+from dt_viz.session.progress import READ, Message, Pace, Progress
 from dt_viz.session.session import Session
 from dt_viz.ui.tabs.status import (
     BUTTON,
@@ -414,6 +414,15 @@ def test_what_is_refused_is_said_beside_the_panel_too(server):
     assert "at least 20" in text and text in html.unescape(panel.status.line.content)
     assert colour[0] > 2 * max(colour[1:])  # red
     server.gui.reset()
+
+
+def test_a_notice_leaves_the_scene_long_before_the_status_line_forgets_it(page, monkeypatch):
+    shown = []
+    monkeypatch.setattr(page.client, "add_notification", lambda _title, text, **how: shown.append((text, how)))
+    page.session.say("file.csv: points: found 3; accepted: at least 20", Severity.ALARM)
+    ((text, how),) = shown
+    assert text in html.unescape(page.visitor._panel.status.line.content)
+    assert 3.0 < how["auto_close_seconds"] < READ / 4
 
 
 def test_the_status_of_another_task_is_pale_and_says_what_is_done(panel):
