@@ -210,8 +210,9 @@ class TestFigure:
         picture = saving.visitor.pictures.layer("compared")
         picture.draw(frame, Look())
         picture.visible = True
-        drawn = figure._scene(frame, "")
-        in_scene = {(name, figure._hex(colour)) for name, colour in picture.key.lines}
+        drawn, key = figure._scene(frame, ""), picture.key
+        picture.visible = False
+        in_scene = {(name, figure._hex(colour)) for name, colour in key.lines}
         assert len(in_scene) == 3 and in_scene <= {(part.label, part.colour) for part in drawn.strokes}
         assert {name for name, _ in in_scene} <= set(texts(render_figure(frame, ".svg")))
         for motions in picture.motions.values():

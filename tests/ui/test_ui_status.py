@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any, cast
 
 import pytest
-from pages import Edited, frame_of, panel_of, wait_until
+from pages import Edited, Page, frame_of, panel_of, wait_until
 from scenes import avoiding, beside, biases, changed
 
 from dt_viz.avoidance.bias import BiasPoint
@@ -414,6 +414,16 @@ def test_what_is_refused_is_said_beside_the_panel_too(server):
     assert "at least 20" in text and text in html.unescape(panel.status.line.content)
     assert colour[0] > 2 * max(colour[1:])  # red
     server.gui.reset()
+
+
+@pytest.fixture
+def page(server, robot):
+    """A page of its own: panels of other tests take away all controls when they end."""
+    page = Page(server, robot)
+    yield page
+    page.close()
+    server.gui.reset()
+    server.scene.reset()
 
 
 def test_a_notice_leaves_the_scene_long_before_the_status_line_forgets_it(page, monkeypatch):
