@@ -21,10 +21,8 @@ from dt_viz.evaluate.protocol_client import ANSWERED, ProtocolClient
 from dt_viz.serving.listening import listen
 
 FOLDER = Path(__file__).parents[2] / "assets" / "serving"
-COMMANDS = {
-    name: shutil.which(name, path=os.pathsep.join([os.environ.get("PATH", ""), "/usr/sbin"]))
-    for name in ("nginx", "caddy")
-}
+PATHS = os.pathsep.join([os.environ.get("PATH", ""), "/usr/sbin"])
+COMMANDS = {name: shutil.which(name, path=PATHS) or "" for name in ("nginx", "caddy")}
 NAME, PASSWORD = "lecturer", "attractor"
 PLACE = (0.1, -0.5, 0.345)
 FORGED = "203.0.113.9"
@@ -97,7 +95,7 @@ def free_port():
 def behind(request, tmp_path, certificate):
     """What runs the proxy before a server, and the port under which it answers."""
     kind = request.param
-    if COMMANDS[kind] is None:
+    if not COMMANDS[kind]:
         assert not os.environ.get("DT_VIZ_REQUIRE_BROWSER"), f"install it: apt-get install {kind}"
         pytest.skip(f"{kind} is not installed")
     port = free_port()
@@ -138,13 +136,13 @@ class Telling(BaseHTTPRequestHandler):
     """A server that answers with the addresses that it is told."""
 
     def do_GET(self):
-        content = "|".join(self.headers.get_all("X-Forwarded-For")).encode()
+        content = "|".join(self.headers.get_all("X-Forwarded-For") or ()).encode()
         self.send_response(200)
         self.send_header("Content-Length", str(len(content)))
         self.end_headers()
         self.wfile.write(content)
 
-    def log_message(self, *_arguments):
+    def log_message(self, format, *args):
         pass
 
 
