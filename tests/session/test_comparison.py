@@ -273,6 +273,8 @@ def test_plots_have_a_curve_for_each_method_that_moves(server, beside):
     panel.draw(frames[-1].comparison)
     assert [len(plot.data) for plot in plots] == [len(plot.series) for plot in plots] == [4] * 4
     np.testing.assert_array_equal(*(both[1].data for both in panel.plots))
+    named = [compared.method.title for compared in frames[-1].comparison]
+    assert all(title in key.content for title in named for key in panel.keys)
     panel.draw(())
     assert len(plots[0].data) == 4
     server.gui.reset()

@@ -23,7 +23,7 @@ from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.comparison import COLOURS
 from dt_viz.ui.scene.palette import css
 from dt_viz.ui.tabs.data import SAVE, curves_table, scores_table, table_csv
-from dt_viz.ui.tabs.plots import LARGE, add_container, add_plot, columns, curve, small
+from dt_viz.ui.tabs.plots import LARGE, add_container, add_plot, columns, curve, legend, small
 
 NONE = "–"
 DEEP = 0.001
@@ -64,9 +64,12 @@ class ComparePanel:
         )
         self.plots: list[tuple[viser.GuiUplotHandle, ...]] = []
         """One for each of `TITLES`, below the table and in a window."""
+        self.keys: list[viser.GuiHtmlHandle] = []
+        """Names of the curves, above both."""
         for large in (False, True):
             node, content = add_container(gui, "Along the path (fig. 6)", large=large)
             with content:
+                self.keys.append(gui.add_html(""))
                 height = 130 * (LARGE if large else 1)
                 self.plots.append(tuple(add_plot(gui, title, "path", _curves(()), height) for title in TITLES))
             bindings.properties(
@@ -89,10 +92,13 @@ class ComparePanel:
         methods = tuple(compared.method for compared in plotted)
         curves = [1e3 * compared.curves for compared in plotted if compared.curves is not None]
         along = np.linspace(0, 1, NUM_SAMPLES)
-        for k, plot in ((k, plot) for plots in self.plots for k, plot in enumerate(plots)):
-            if methods != self._drawn:
-                plot.series = (uplot.Series(label="path"), *_curves(methods))
-            plot.data = columns(along, *(curve[:, k] for curve in curves)) if curves else (np.zeros(2),) * 2
+        marks = {method.title: f"background:{css(_colour(method.name))}" for method in methods}
+        for plots, key in zip(self.plots, self.keys, strict=True):
+            key.content = legend(marks, "0.3em")
+            for k, plot in enumerate(plots):
+                if methods != self._drawn:
+                    plot.series = (uplot.Series(label="path"), *_curves(methods))
+                plot.data = columns(along, *(curve[:, k] for curve in curves)) if curves else (np.zeros(2),) * 2
         self._drawn = methods
 
     def _save(self, _session: Session, _pressed: bool) -> None:
