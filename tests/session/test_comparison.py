@@ -272,7 +272,8 @@ def test_plots_have_a_curve_for_each_method_that_moves(server, beside):
     assert [len(plot.data) for plot in plots] == [3] * 4  # the slow one is not there yet
     panel.draw(frames[-1].comparison)
     assert [len(plot.data) for plot in plots] == [len(plot.series) for plot in plots] == [4] * 4
-    np.testing.assert_array_equal(*(both[1].data for both in panel.plots))
+    in_tab, in_window = (both[1].data for both in panel.plots)
+    np.testing.assert_array_equal(in_tab, in_window)
     named = [compared.method.title for compared in frames[-1].comparison]
     assert all(title in key.content for title in named for key in panel.keys)
     panel.draw(())
