@@ -211,7 +211,13 @@ class ControlPanel:
         )
 
     def _learn(self, session: Session, task: Task) -> None:
-        self.begin(lambda session, _title: session.choose_task(self._bring(session, task)), session, task.title)
+        """Begin with a task of the visitor's own: with the present choices, or as a saved motion begins."""
+
+        def begin(session: Session, _title: str) -> None:
+            choose = session.choose_task if task.imitation is None else session.begin_task
+            choose(self._bring(session, task))
+
+        self.begin(begin, session, task.title)
 
     def _bring(self, session: Session, task: Task, arm: str | None = None) -> str:
         """Take a task of the visitor's own; return its name. See `Session.bring`."""
