@@ -11,8 +11,9 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -26,7 +27,8 @@ from dt_viz.ui.origins import Origin, OriginError
 if TYPE_CHECKING:
     from dt_viz.learning.store import FitStore
     from dt_viz.robot.robot import Robot
-    from dt_viz.scenario.tasks import Task
+    from dt_viz.scenario.saved import Saved
+    from dt_viz.scenario.tasks import Task, TaskEntry
     from dt_viz.serving.board import Share
     from dt_viz.ui.server import Server
 
@@ -64,11 +66,10 @@ def _serve(options: argparse.Namespace) -> int:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # numerical libraries read these when they are first imported
-    from dt_viz.errors import DataError  # noqa: PLC0415
+    from dt_viz.errors import DataError, FormatError  # noqa: PLC0415
     from dt_viz.folders import default_cache_folder  # noqa: PLC0415
     from dt_viz.learning.imitation import ImitationError  # noqa: PLC0415
     from dt_viz.learning.store import FitStore  # noqa: PLC0415
-    from dt_viz.scenario.tasks import OWN, TaskEntry, known_tasks  # noqa: PLC0415
     from dt_viz.serving.board import Board, own_share  # noqa: PLC0415
     from dt_viz.serving.listening import AddressError, listen  # noqa: PLC0415
     from dt_viz.serving.supervisor import Supervisor  # noqa: PLC0415
@@ -79,14 +80,7 @@ def _serve(options: argparse.Namespace) -> int:
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s", handlers=[handler])
     try:
         robot = _robot(options)
-        tasks = known_tasks(options.lasa)
-        if options.files:
-            own = _own(options, robot)
-            tasks = {OWN: TaskEntry(own.title, lambda: own, own.demonstrations[0].dimension != 2), **tasks}
-        begin = options.task or (OWN if options.files else "draw_s")
-        if begin not in tasks:
-            print(f"{PROG}: --task: found {begin!r}; accepted: {', '.join(tasks)}", file=sys.stderr)
-            return 2
+        tasks, begin, begins = _offered(options, robot)
         fits = FitStore(default_cache_folder())
         if options.prepare_all or options.prepare_only:
             for name in tasks:
@@ -97,7 +91,7 @@ def _serve(options: argparse.Namespace) -> int:
         if options.prepare_only:
             return 0
         listening = listen(options.host, options.port)
-    except (DataError, ImitationError, AddressError, FileNotFoundError) as error:
+    except (DataError, FormatError, ImitationError, AddressError, FileNotFoundError) as error:
         print(f"{PROG}: {error}", file=sys.stderr)
         return 2
 
@@ -121,6 +115,7 @@ def _serve(options: argparse.Namespace) -> int:
         max_of_address=options.max_of_address,
         allowed=options.allow_origin,
         key=key,
+        begins=begins,
     )
     prepare = partial(_prepare, fits, tasks[begin](), robot)
     num_processes, num_connections = 1 if key else _num_processes(options.processes), max_sessions + MAX_WAITING
@@ -129,6 +124,59 @@ def _serve(options: argparse.Namespace) -> int:
             return _work(new_server, prepare, own_share(num_connections), listening, ready)
         work = partial(_work, new_server, prepare)
         return Supervisor(listening, Board(num_processes, num_connections), work, ready).run()
+
+
+def _offered(options: argparse.Namespace, robot: Robot) -> tuple[Mapping[str, TaskEntry], str, Saved | None]:
+    """Return the tasks of all visitors, the name of the first one, and the saved scenario that is given, if one is.
+
+    A scenario's own task is among them unless it is placed for another arm: then each page brings it.
+
+    Raises:
+        DataError: what is given cannot be used.
+        FormatError: there is no such task.
+    """
+    from dt_viz.errors import FormatError  # noqa: PLC0415
+    from dt_viz.scenario.tasks import OWN, TaskEntry, known_tasks  # noqa: PLC0415
+
+    tasks, own, given = known_tasks(options.lasa), None, _scenario(options, robot)
+    if given is not None and given.own is not None and not given.scenario.arm:
+        own, given = replace(given.own.task, name=OWN), replace(given, own=None)
+    elif given is None and options.files:
+        own = _own(options, robot)
+    if own is not None:
+        stays = given is not None or own.demonstrations[0].dimension != 2
+        tasks = {OWN: TaskEntry(own.title, lambda: own, stays), **tasks}
+    wanted = options.task or (OWN if given is None and own is not None else "draw_s")
+    if wanted not in tasks:
+        raise FormatError("--task", repr(wanted), ", ".join(tasks))
+    begins_with = wanted if given is None or given.scenario.task not in tasks else given.scenario.task
+    return tasks, begins_with, given
+
+
+def _scenario(options: argparse.Namespace, robot: Robot) -> Saved | None:
+    """Read the saved scenario that is given; None where the files are no scenario.
+
+    Raises:
+        DataError: it cannot be used, or something is given beside it.
+    """
+    from dt_viz.errors import DataError  # noqa: PLC0415
+    from dt_viz.learning.store import FitStore  # noqa: PLC0415
+    from dt_viz.saving import is_scenario, read_scenario  # noqa: PLC0415
+    from dt_viz.scenario.tasks import known_tasks  # noqa: PLC0415
+    from dt_viz.session.arms import ArmStore  # noqa: PLC0415
+    from dt_viz.ui.visitor import known_names  # noqa: PLC0415
+
+    found = [path for path in map(Path, options.files) if is_scenario(path)]
+    if not found:
+        return None
+    if len(options.files) > 1:
+        raise DataError(found[0], "files", f"a saved scenario among {len(options.files)} files", "it alone")
+    names = ("task", "rate", "unit", "columns", "topic")
+    unused = [f"--{name}" for name in names if getattr(options, name) is not None]
+    if unused:
+        raise DataError(found[0], ", ".join(unused), "an option beside a saved scenario", "the scenario alone")
+    tasks = known_tasks(options.lasa)
+    return read_scenario(found[0], known_names(tasks, ArmStore(tasks, FitStore(None), robot).titles))
 
 
 def _own(options: argparse.Namespace, robot: Robot) -> Task:
@@ -253,7 +301,7 @@ def _parser() -> argparse.ArgumentParser:
         nargs="*",
         metavar="FILE",
         help="your own demonstrations: text, .npz, .npy, .mat, .json, .parquet, .hdf5, ROS bags, or folders of them; "
-        "or one motion that the library has saved",
+        "or one motion that the library has saved, or one scenario that the page has saved",
     )
     parser.add_argument("--rate", type=float, metavar="HZ", help="samples per second of files without times")
     parser.add_argument("--unit", metavar="UNIT", help="units of the files, such as mm or cm,ms,deg, if not recognised")

@@ -39,7 +39,8 @@ from dt_viz.learning.preparation import ImitationError
 from dt_viz.obstacles.shapes import SHAPES, Obstacle
 from dt_viz.scenario.own import Own
 from dt_viz.scenario.relocation import in_world
-from dt_viz.scenario.saved import MAX_PLAIN, Known, Saved, check_shapes, decode, encode, is_saved
+from dt_viz.scenario.saved import MAX_BYTES as MAX_SCENARIO
+from dt_viz.scenario.saved import MAX_PLAIN, Known, Saved, ScenarioError, check_shapes, decode, encode, is_saved
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.tasks import OWN, TASKS, Task, own_task
 
@@ -107,6 +108,25 @@ def save_scenario(path: str | os.PathLike[str], saved: Saved) -> None:
     path, content = Path(path), encode(saved).encode()
     decode(content, KNOWN, str(path))  # what could not be read is refused now
     write_whole(path, content)
+
+
+def is_scenario(path: Path) -> bool:
+    """Return whether a file says that it is a saved scenario, whether or not it can be read."""
+    is_small = path.is_file() and path.stat().st_size <= MAX_SCENARIO
+    return is_small and path.suffix.lower() == ".json" and is_saved(path.read_bytes())
+
+
+def read_scenario(path: Path, known: Known) -> Saved:
+    """Read a scenario from a file, with the surfaces of its obstacles, which take seconds.
+
+    Raises:
+        DataError: there is no such file, it is no scenario, or has a value that no page of these names gives.
+    """
+    with parsing(ScenarioError, path, "path", "a readable file"):
+        content = read_bytes(path, MAX_SCENARIO)
+    saved = decode(content, known, str(path))
+    check_shapes(saved.scenario, str(path))
+    return saved
 
 
 def is_motion(file: bytes | Path) -> bool:

@@ -68,6 +68,11 @@ def initial(task: Task) -> Scenario:
     return replace(scenario, stack=with_avoidance(scenario, obstacles=(sphere,)))
 
 
+def known_names(tasks: Collection[str], arms: Collection[str]) -> Known:
+    """Return the names that a scenario may have on a page of these tasks and arms."""
+    return Known(tasks, arms, tuple(method.name for method in OTHERS))
+
+
 def _takes_long(saved: Saved) -> bool:
     """Whether another arm, surfaces of obstacles, or a task are to be made for a scenario before it is shown."""
     shapes = any(isinstance(obstacle, TriangleObstacle) for obstacle in saved.scenario.obstacles)
@@ -96,10 +101,12 @@ class Visitor(Display):
         arms: ArmStore | None = None,
         share: Share | None = None,
         account: Account | None = None,
+        begins: Saved | None = None,
     ) -> None:
         """Build the page for an engine of its own and start computing; there is one arm where there are no `arms`.
 
-        Edits and pictures are counted in the `share` of this process, processor time in the visitor's `account`.
+        Where the browser keeps nothing, the page `begins` with a scenario, or else as the task does. Edits and pictures
+        are counted in the `share` of this process, processor time in the visitor's `account`.
         """
         self.client = client
         self.shown: Frame | None = None
@@ -115,8 +122,7 @@ class Visitor(Display):
         self._studio = Studio(self.pictures, lambda: self.robot, self._changing)
         titled = {"": robot.title} if arms is None else arms.titles
         pen = Pen(self.pictures, lambda: self.robot, lambda: self.session, self._face)
-        methods = tuple(method.name for method in OTHERS)
-        self._keeper = Keeper(client.local_storage, Known(titles, titled, methods), self._made)
+        self._keeper = Keeper(client.local_storage, known_names(titles, titled), self._made)
         self._camera = CameraController(client, lambda: self.robot.hand, robot.size, self._keeper.changed)
         self._panel = ControlPanel(
             client.gui,
@@ -140,12 +146,18 @@ class Visitor(Display):
             client.local_storage,
             self._came_back,
         )
+        later = begins if self._keeper.begun is None else None
+        if later is not None and not _takes_long(later):
+            self._keeper.go_on(later)
+            later = None
         begun = self._keeper.begun
         at_once = None if begun is None or _takes_long(begun) else begun.scenario
         display = self if share is None else Counted(self, share)
         self.session = Session(engine, initial_scenario, task, display, arms and arms.engine, at_once, account)
         self._panel.connect(self.session)
         self._keeper.begin(self.session, self._resume)
+        if later is not None:
+            self._resume(later)
         self._panel.tour.begin(self.session)
         self.ruler = Ruler()
         """What the visitor's window is measured with."""
