@@ -51,6 +51,8 @@ MAX_BYTES = 40 * 10**6
 """Largest number of bytes of a file, and of what it unpacks to."""
 KNOWN = Known(tuple(TASKS), arms=None, methods=None)
 """What scenarios may name."""
+MAX_SCENARIOS = 100
+"""Largest number of scenarios that a server offers."""
 TEXT, LEARNED = "motion", "imitation."
 """Name of the array that holds the text, and prefix of those of the imitation."""
 FIRST = f"{TEXT}.npy".encode()
@@ -127,6 +129,28 @@ def read_scenario(path: Path, known: Known) -> Saved:
     saved = decode(content, known, str(path))
     check_shapes(saved.scenario, str(path))
     return saved
+
+
+def read_scenarios(folder: Path, known: Known) -> tuple[Mapping[str, Saved], tuple[DataError, ...]]:
+    """Read the scenarios of a folder, by the names of their files without the suffix; return also what is refused.
+
+    Raises:
+        ScenarioError: it is no folder, or holds no .json file, or too many.
+    """
+    with parsing(ScenarioError, folder, "folder", "a readable folder"):
+        paths = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".json")
+        if not 1 <= len(paths) <= MAX_SCENARIOS:
+            raise FormatError("folder", f"{len(paths)} .json files", f"1 to {MAX_SCENARIOS} saved scenarios")
+    read, refused = dict[str, Saved](), list[DataError]()
+    for path in paths:
+        try:
+            if not re.fullmatch(r"[\w-]{1,60}", path.stem, re.ASCII):
+                accepted = "letters, digits, - and _, up to 60, as a link has them"
+                raise ScenarioError(path, "name", repr(path.stem)[:80], accepted)
+            read[path.stem] = read_scenario(path, known)
+        except DataError as error:
+            refused.append(error)
+    return read, tuple(refused)
 
 
 def is_motion(file: bytes | Path) -> bool:

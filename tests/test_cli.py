@@ -163,16 +163,46 @@ def test_a_saved_scenario_is_what_each_page_begins_with(monkeypatch, tmp_path, c
             ("--task", "draw_s"),
             "mine.json: --task: found an option beside a saved scenario; accepted: the sc",
         ),
-        (("", ""), ("mine.json",), "mine.json: files: found a saved scenario among 2 files; accepted: it alone"),
+        (
+            ("", ""),
+            ("mine.json",),
+            "mine.json: files: found a saved scenario among 2 files; accepted: it alone, or --scenarios",
+        ),
         (("", ""), ("takes.csv",), "mine.json: files: found a saved scenario among 2 files; accepted: it alone"),
     ],
 )
 def test_a_scenario_that_cannot_be_opened_is_one_line(monkeypatch, tmp_path, capsys, change, arguments, said):
     monkeypatch.chdir(tmp_path)
-    text = encode(OWN_SAVED)
-    (tmp_path / "mine.json").write_text(text.replace(*change, 1))
+    old, new = change
+    (tmp_path / "mine.json").write_text(encode(OWN_SAVED).replace(old, new, 1))
     given, error = served(monkeypatch, capsys, "mine.json", *arguments)
     assert not given and error.startswith(f"dt-viz: {said}") and error.count("\n") == 1
+
+
+def test_scenarios_of_a_folder_are_offered_by_their_names_and_each_that_is_refused_is_a_line(
+    monkeypatch, tmp_path, capsys
+):
+    text = encode(OWN_SAVED)
+    for name in ("lesson-1", "Lesson_2", "a b", "ä", "x" * 61):
+        (tmp_path / f"{name}.json").write_text(text)
+    (tmp_path / "damaged.json").write_text(text.replace('"warp":0.5', '"warp":7.0'))
+    (tmp_path / "other.json").write_text("[1, 2]")
+    (tmp_path / "takes.csv").write_text("no scenario")
+    given, error = served(monkeypatch, capsys, "--scenarios", tmp_path)
+    assert [*given["scenarios"]] == ["Lesson_2", "lesson-1"] and given["begins"] is None
+    assert given["scenarios"]["lesson-1"].scenario == OWN_SAVED.scenario
+    *refused, _served = error.splitlines()
+    assert len(refused) == 5 and all(": found " in line for line in refused)
+    assert any("damaged.json: warp: found 7; accepted: 0 to 1" in line for line in refused)
+    assert sum(": name: found " in line for line in refused) == 3
+
+
+@pytest.mark.parametrize(("num", "said"), [(0, "found 0 .json files; accepted: 1 to 100"), (101, "found 101 .json")])
+def test_a_folder_without_scenarios_or_with_very_many_is_refused(tmp_path, capsys, num, said):
+    for k in range(num):
+        (tmp_path / f"{k}.json").touch()
+    assert main(["--scenarios", str(tmp_path)]) == 2
+    assert said in capsys.readouterr().err
 
 
 def test_handlers_of_signals_are_as_before_when_it_returns(capsys):

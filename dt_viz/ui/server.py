@@ -9,6 +9,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import NoReturn
 
 import viser
@@ -68,6 +69,7 @@ class Server:
         allowed: Sequence[Origin] = (),
         key: str | None = None,
         begins: Saved | None = None,
+        scenarios: Mapping[str, Saved] = MappingProxyType({}),
     ) -> None:
         """Listen and wait for visitors.
 
@@ -87,6 +89,7 @@ class Server:
             allowed: origins of other pages that may connect; see `Origins`.
             key: makes all visitors watch the one who has it; see `Lecture`. Without one each has a private scene.
             begins: scenario of each new visitor, whose names these tasks and arms have; None is as the task begins.
+            scenarios: scenarios that links may name, such as `/?scenario=lesson-1`, with such names, too.
 
         Raises:
             AddressError: the address is not available.
@@ -105,6 +108,7 @@ class Server:
             self._share,
             accounts.opened(self.gate.address(client)),
             begins,
+            scenarios,
         )
         self._lock = threading.Condition()
         self._visitors: dict[int, Visitor | None] = {}

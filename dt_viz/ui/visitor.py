@@ -8,6 +8,7 @@ from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
+from types import MappingProxyType
 
 import numpy as np
 import viser
@@ -39,7 +40,7 @@ from dt_viz.ui.keeping import Keeper
 from dt_viz.ui.panel import ControlPanel
 from dt_viz.ui.pen import Pen
 from dt_viz.ui.playback import Playback, Replay
-from dt_viz.ui.scene.camera import CameraController, Framing, Pose, shot_of, view_of
+from dt_viz.ui.scene.camera import CameraController, Framing, Pose, shot_beside, shot_of, view_of
 from dt_viz.ui.scene.export import RESOLUTIONS, render_frame, render_png
 from dt_viz.ui.scene.film import MOTION, SETTINGS, TURNTABLE, Film, Rendering, encoded, motion, turntable, warping
 from dt_viz.ui.scene.key import Key
@@ -102,11 +103,13 @@ class Visitor(Display):
         share: Share | None = None,
         account: Account | None = None,
         begins: Saved | None = None,
+        scenarios: Mapping[str, Saved] = MappingProxyType({}),
     ) -> None:
         """Build the page for an engine of its own and start computing; there is one arm where there are no `arms`.
 
-        Where the browser keeps nothing, the page `begins` with a scenario, or else as the task does. Edits and pictures
-        are counted in the `share` of this process, processor time in the visitor's `account`.
+        Where the browser keeps nothing, the page `begins` with a scenario, or else as the task does; a link may name
+        one of the `scenarios`. Edits and pictures are counted in the `share` of this process, processor time in the
+        visitor's `account`.
         """
         self.client = client
         self.shown: Frame | None = None
@@ -159,7 +162,7 @@ class Visitor(Display):
         if later is not None:
             self._resume(later)
         self._panel.tour.begin(self.session)
-        self.ruler = Ruler()
+        self.ruler = Ruler(scenarios)
         """What the visitor's window is measured with."""
         self.robot.playback.begin(self.session.jobs, self.session.fail)
         keep_ready(self)
@@ -171,7 +174,8 @@ class Visitor(Display):
     def told(self, what: float | Link) -> None:
         """Take the width of the window, CSS pixels, or begin what the link of the page asks for."""
         if isinstance(what, Link):
-            self._panel.follow(self.session, what)
+            offered = self.ruler.scenarios.items()
+            self._panel.follow(self.session, what, {name: partial(self._resume, saved) for name, saved in offered})
         else:
             self._camera.measured(what)
 
@@ -340,12 +344,18 @@ class Visitor(Display):
         with self._studio.rendering():
             return render_png(self.client, size, self._camera.shot(size), self._legends, transparent=transparent)
 
-    def render_alone(self, size: tuple[int, int], timeout: float) -> bytes:
-        """Render the scene that is shown as `render` does, but framed in all of the picture; `timeout` in seconds."""
+    def render_alone(self, size: tuple[int, int], timeout: float, sight: Sight | None = None) -> bytes:
+        """Render the scene that is shown as `render` does, but framed in all of the picture; `timeout` in seconds.
+
+        With a `sight` it is what a camera that looks so shows beside the panel, in a window of the usual size.
+        """
         self.robot.playback.advance(0.0)
         self.client.flush()
         with self._studio.rendering():
-            shot = shot_of(self._pose_alone(size))
+            pose = self._pose_alone(size) if sight is None else (np.array(sight[0]), np.array(sight[1]))
+            shot = shot_of(pose)
+            if sight is not None:
+                shot = shot_beside(pose, shot.wxyz, Framing(), size)
             return render_png(self.client, size, shot, self._legends, transparent=False, timeout=timeout)
 
     def _pose_alone(self, size: tuple[int, int]) -> Pose:

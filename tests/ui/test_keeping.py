@@ -4,6 +4,7 @@ import threading
 import time
 from dataclasses import replace
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from dt_viz.session.session import CHOICES
 from dt_viz.ui import keeping, panel
 from dt_viz.ui.keeping import KEY, LANE, PAUSE
 from dt_viz.ui.scene.camera import view_of
-from dt_viz.ui.scripts import Link
+from dt_viz.ui.scripts import Link, told
 from dt_viz.ui.tabs.status import verdict
 from dt_viz.ui.visitor import initial_scenario
 
@@ -446,6 +447,19 @@ def test_a_new_visitor_begins_with_the_servers_demonstrations_once(opened_for, k
     settled(page)
     assert (page.session.scenario.task, page.session.scenario.warp) == ("own_data_1", 0.5)
     assert page["Task"].value == "Your data"
+
+
+def test_a_link_opens_a_scenario_that_the_server_offers_by_its_name(opened_for):
+    page = opened_for(Browser(), scenarios={"lesson-1": Saved(MADE, SIGHT), "lesson-2": own_of()})
+    for name, task in (("lesson-1", MADE.task), ("lesson-2", "own_data_1"), ("../lesson-1", "own_data_1")):
+        _token, link = told(f"/window/a/scenario/{quote(name, safe='')}") or ("", 0.0)
+        page.visitor.told(link)
+        assert page.session.jobs.wait_idle(CHOICES, PATIENCE)
+        assert page.session.scenario.task == task
+    assert message(page) == "The link: scenario: found '../lesson-1'; accepted: lesson-1, lesson-2"
+    page = opened_for(Browser())
+    page.visitor.told(Link("scenario", ""))
+    assert message(page) == "The link: scenario: found ''; accepted: none: this server offers none"
 
 
 # --- the camera ---
