@@ -11,8 +11,9 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -26,7 +27,8 @@ from dt_viz.ui.origins import Origin, OriginError
 if TYPE_CHECKING:
     from dt_viz.learning.store import FitStore
     from dt_viz.robot.robot import Robot
-    from dt_viz.scenario.tasks import Task
+    from dt_viz.scenario.saved import Known, Saved
+    from dt_viz.scenario.tasks import Task, TaskEntry
     from dt_viz.serving.board import Share
     from dt_viz.ui.server import Server
 
@@ -40,6 +42,19 @@ MAX_SESSIONS, MAX_WATCHING = 8, 50
 """Largest numbers of visitors unless they are chosen: each with a private scene, and all with one."""
 MEASURE, PICTURE = "evaluate", "picture"
 """Subcommands of the measurements and of pictures; without one the demo starts."""
+
+
+@dataclass(frozen=True)
+class _Offered:
+    """What the server offers."""
+
+    tasks: Mapping[str, TaskEntry]
+    first: str
+    """Name of the task that visitors begin with."""
+    begins: Saved | None
+    """Scenario that they begin with, if one is given."""
+    scenarios: Mapping[str, Saved]
+    """Scenarios that links may name."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -64,11 +79,10 @@ def _serve(options: argparse.Namespace) -> int:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # numerical libraries read these when they are first imported
-    from dt_viz.errors import DataError  # noqa: PLC0415
+    from dt_viz.errors import DataError, FormatError  # noqa: PLC0415
     from dt_viz.folders import default_cache_folder  # noqa: PLC0415
     from dt_viz.learning.imitation import ImitationError  # noqa: PLC0415
     from dt_viz.learning.store import FitStore  # noqa: PLC0415
-    from dt_viz.scenario.tasks import OWN, TaskEntry, known_tasks  # noqa: PLC0415
     from dt_viz.serving.board import Board, own_share  # noqa: PLC0415
     from dt_viz.serving.listening import AddressError, listen  # noqa: PLC0415
     from dt_viz.serving.supervisor import Supervisor  # noqa: PLC0415
@@ -79,25 +93,18 @@ def _serve(options: argparse.Namespace) -> int:
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s", handlers=[handler])
     try:
         robot = _robot(options)
-        tasks = known_tasks(options.lasa)
-        if options.files:
-            own = _own(options, robot)
-            tasks = {OWN: TaskEntry(own.title, lambda: own, own.demonstrations[0].dimension != 2), **tasks}
-        begin = options.task or (OWN if options.files else "draw_s")
-        if begin not in tasks:
-            print(f"{PROG}: --task: found {begin!r}; accepted: {', '.join(tasks)}", file=sys.stderr)
-            return 2
+        offered = _offered(options, robot)
         fits = FitStore(default_cache_folder())
         if options.prepare_all or options.prepare_only:
-            for name in tasks:
-                task = tasks[name]()
+            for entry in offered.tasks.values():
+                task = entry()
                 fits.get(task.demonstrations, progress=_Bar(f"Learning {task.title}"))
                 print(f"Ready: {task.title}", flush=True)
             _compile(robot, threading.Event())
         if options.prepare_only:
             return 0
         listening = listen(options.host, options.port)
-    except (DataError, ImitationError, AddressError, FileNotFoundError) as error:
+    except (DataError, FormatError, ImitationError, AddressError, FileNotFoundError) as error:
         print(f"{PROG}: {error}", file=sys.stderr)
         return 2
 
@@ -107,28 +114,98 @@ def _serve(options: argparse.Namespace) -> int:
         print(f"DT-Viz is at {address} (Ctrl-C stops it)", flush=True)
         if key is not None:
             print(f"To present, open {address}/?present={key}; all others watch", flush=True)
+        for name in offered.scenarios:
+            print(f"{address}/?scenario={name}", flush=True)
 
     key = secrets.token_urlsafe(16) if options.present else None
     max_sessions = options.max_sessions or (MAX_WATCHING if options.present else MAX_SESSIONS)
     new_server = partial(
         Server,
-        tasks,
+        offered.tasks,
         fits,
         robot,
-        task=begin,
+        task=offered.first,
         host=options.host,
         max_sessions=max_sessions,
         max_of_address=options.max_of_address,
         allowed=options.allow_origin,
         key=key,
+        begins=offered.begins,
+        scenarios=offered.scenarios,
     )
-    prepare = partial(_prepare, fits, tasks[begin](), robot)
+    prepare = partial(_prepare, fits, offered.tasks[offered.first](), robot)
     num_processes, num_connections = 1 if key else _num_processes(options.processes), max_sessions + MAX_WAITING
     with listening:
         if num_processes == 1:
             return _work(new_server, prepare, own_share(num_connections), listening, ready)
         work = partial(_work, new_server, prepare)
         return Supervisor(listening, Board(num_processes, num_connections), work, ready).run()
+
+
+def _offered(options: argparse.Namespace, robot: Robot) -> _Offered:
+    """Return what the server offers.
+
+    A scenario's own task is among them unless it is placed for another arm: then each page brings it.
+
+    Raises:
+        DataError: what is given cannot be used.
+        FormatError: there is no such task.
+    """
+    from dt_viz.errors import FormatError  # noqa: PLC0415
+    from dt_viz.learning.store import FitStore  # noqa: PLC0415
+    from dt_viz.scenario.tasks import OWN, TaskEntry, known_tasks  # noqa: PLC0415
+    from dt_viz.session.arms import ArmStore  # noqa: PLC0415
+    from dt_viz.ui.visitor import known_names  # noqa: PLC0415
+
+    tasks, own = known_tasks(options.lasa), None
+    known = known_names(tasks, ArmStore(tasks, FitStore(None), robot).titles)
+    given, scenarios = _scenario(options, known), _scenarios(options, known)
+    if given is not None and given.own is not None and not given.scenario.arm:
+        own, given = replace(given.own.task, name=OWN), replace(given, own=None)
+    elif given is None and options.files:
+        own = _own(options, robot)
+    if own is not None:
+        stays = given is not None or own.demonstrations[0].dimension != 2
+        tasks = {OWN: TaskEntry(own.title, lambda: own, stays), **tasks}
+    wanted = options.task or (OWN if given is None and own is not None else "draw_s")
+    if wanted not in tasks:
+        raise FormatError("--task", repr(wanted), ", ".join(tasks))
+    begins_with = wanted if given is None or given.scenario.task not in tasks else given.scenario.task
+    return _Offered(tasks, begins_with, given, scenarios)
+
+
+def _scenario(options: argparse.Namespace, known: Known) -> Saved | None:
+    """Read the saved scenario that is given; None where the files are no scenario.
+
+    Raises:
+        DataError: it cannot be used, or something is given beside it.
+    """
+    from dt_viz.errors import DataError  # noqa: PLC0415
+    from dt_viz.saving import is_scenario, read_scenario  # noqa: PLC0415
+
+    found = [path for path in map(Path, options.files) if is_scenario(path)]
+    if not found:
+        return None
+    if len(options.files) > 1:
+        accepted = "it alone, or --scenarios FOLDER for several"
+        raise DataError(found[0], "files", f"a saved scenario among {len(options.files)} files", accepted)
+    names = ("task", "rate", "unit", "columns", "topic")
+    unused = [f"--{name}" for name in names if getattr(options, name) is not None]
+    if unused:
+        raise DataError(found[0], ", ".join(unused), "an option beside a saved scenario", "the scenario alone")
+    return read_scenario(found[0], known)
+
+
+def _scenarios(options: argparse.Namespace, known: Known) -> Mapping[str, Saved]:
+    """Read the scenarios that links may name, with a line for each that is refused. Raises DataError without any."""
+    from dt_viz.saving import read_scenarios  # noqa: PLC0415
+
+    if options.scenarios is None:
+        return {}
+    read, refused = read_scenarios(options.scenarios, known)
+    for error in refused:
+        print(f"{PROG}: {error}", file=sys.stderr)
+    return read
 
 
 def _own(options: argparse.Namespace, robot: Robot) -> Task:
@@ -253,7 +330,13 @@ def _parser() -> argparse.ArgumentParser:
         nargs="*",
         metavar="FILE",
         help="your own demonstrations: text, .npz, .npy, .mat, .json, .parquet, .hdf5, ROS bags, or folders of them; "
-        "or one motion that the library has saved",
+        "or one motion that the library has saved, or one scenario that the page has saved",
+    )
+    parser.add_argument(
+        "--scenarios",
+        type=Path,
+        metavar="FOLDER",
+        help="folder of scenarios that the page has saved: a link such as /?scenario=lesson-1 opens lesson-1.json",
     )
     parser.add_argument("--rate", type=float, metavar="HZ", help="samples per second of files without times")
     parser.add_argument("--unit", metavar="UNIT", help="units of the files, such as mm or cm,ms,deg, if not recognised")

@@ -5,6 +5,7 @@ dt-viz picture draw_s --out s.svg
 dt-viz picture fig-4 --out fig4.html
 dt-viz picture tour-2 --out warp.png
 dt-viz picture lift --out lift.mp4 --of turntable
+dt-viz picture mine.json --out mine.png
 """
 
 from __future__ import annotations
@@ -26,8 +27,9 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from dt_viz.motion.following import Follower
+    from dt_viz.scenario.saved import Saved
     from dt_viz.scenario.scenario import Scenario
-    from dt_viz.scenario.tasks import Task
+    from dt_viz.session.arms import ArmStore
     from dt_viz.session.frame import Frame
 
 BAD_INPUT = 2
@@ -63,12 +65,14 @@ class PictureSettings:
 SETTINGS = PictureSettings()
 OF = ("motion", "turntable", "warp")
 """What a video shows."""
+WHAT = "a scene, such as fig-4 or its name, a task, tour-1 to 6, or the .json of a saved scenario"
+"""What there are pictures of."""
 
 
 def main(arguments: Sequence[str], prog: str) -> int:
     """Make a picture; returns the process' exit status, or raises SystemExit where argparse does."""
     parser = argparse.ArgumentParser(prog=prog, description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("scene", metavar="SCENE", help="a scene, such as fig-4 or its name, a task, or tour-1 to 6")
+    parser.add_argument("scene", metavar="SCENE", help=WHAT)
     parser.add_argument(
         "--out", type=Path, required=True, metavar="FILE", help="a .png, .svg, .pdf, .html, .mp4 or .gif"
     )
@@ -85,8 +89,7 @@ def main(arguments: Sequence[str], prog: str) -> int:
     logging.basicConfig(level=logging.CRITICAL)  # what a browser that is closed leaves unsaid is no matter
     try:
         make = _maker(options.out, options.size, options.of)
-        task, scenario = _chosen(options.scene)
-        write_whole(options.out, make(task, scenario))
+        write_whole(options.out, make(_chosen(options.scene)))
     except (DataError, FormatError, ImitationError, OSError, TimeoutError) as error:
         print(f"{prog}: {error}", file=sys.stderr)
         return BAD_INPUT
@@ -94,7 +97,7 @@ def main(arguments: Sequence[str], prog: str) -> int:
     return 0
 
 
-def _maker(out: Path, size: str | None, of: str) -> Callable[[str, Callable[[Task], Scenario]], bytes]:
+def _maker(out: Path, size: str | None, of: str) -> Callable[[Saved], bytes]:
     """Return what makes a file of this kind; raises FormatError before anything is computed where nothing can."""
     from dt_viz.errors import FormatError  # noqa: PLC0415
     from dt_viz.pictures import figures, video  # noqa: PLC0415
@@ -107,7 +110,7 @@ def _maker(out: Path, size: str | None, of: str) -> Callable[[str, Callable[[Tas
         raise FormatError("--out", repr(str(out)), "a file in a folder that exists")
     if out.suffix in SUFFIXES:
         figures.check_installed()
-        return lambda task, scenario: _drawn(task, scenario, out.suffix)
+        return lambda saved: _drawn(saved, out.suffix)
     if out.suffix == ".html":
         return _recorded
     is_video = out.suffix in video.VIDEO_SUFFIXES
@@ -125,65 +128,79 @@ def _maker(out: Path, size: str | None, of: str) -> Callable[[str, Callable[[Tas
     if browser is None:
         accepted = f"one of {', '.join(SETTINGS.browsers)}, or its path in {SETTINGS.variable} (or --out with .svg)"
         raise FormatError("Chromium", repr(given) if given else "none installed", accepted)
-    return lambda task, scenario: _rendered(task, scenario, (width, height), browser, out.suffix, of)
+    return lambda saved: _rendered(saved, (width, height), browser, out.suffix, of)
 
 
-def _chosen(name: str) -> tuple[str, Callable[[Task], Scenario]]:
-    """Return the task, and what makes the scenario, of a scene, a task or a step of the tour.
+def _chosen(name: str) -> Saved:
+    """Return a scene, a task or a step of the tour as a scenario, or the one that a file holds.
 
     Raises:
+        DataError: the file cannot be used.
         FormatError: there is none of that name.
     """
     from dt_viz.errors import FormatError  # noqa: PLC0415
+    from dt_viz.saving import read_scenario  # noqa: PLC0415
     from dt_viz.scenario.paper_scenes import found, offered  # noqa: PLC0415
+    from dt_viz.scenario.saved import Saved  # noqa: PLC0415
     from dt_viz.scenario.tasks import TASKS  # noqa: PLC0415
     from dt_viz.scenario.tour import STEPS, TASK  # noqa: PLC0415
-    from dt_viz.ui.visitor import initial  # noqa: PLC0415
+    from dt_viz.ui.visitor import initial, known_names  # noqa: PLC0415
 
+    if Path(name).suffix.lower() == ".json":
+        return read_scenario(Path(name), known_names(TASKS, _arms().titles))
     scenes = offered(TASKS)
     scene = found(name, scenes) if name else None
     if scene is not None:
-        return scene.task, scene.scenario
+        return Saved(scene.scenario(TASKS[scene.task]()))
     steps = {f"tour-{number}": step.ended for number, step in enumerate(STEPS, start=1)}
     if name in steps:
-        return TASK, steps[name]
+        return Saved(steps[name](TASKS[TASK]()))
     if name not in TASKS:
-        raise FormatError("SCENE", repr(name), ", ".join((*(each.name for each in scenes), *TASKS, *steps)))
-    return name, initial
+        known = *(each.name for each in scenes), *TASKS, *steps
+        raise FormatError("SCENE", repr(name), f"{', '.join(known)}, or the .json of a saved scenario")
+    return Saved(initial(TASKS[name]()))
 
 
-def _computed(task: str, scenario: Callable[[Task], Scenario], stage: str) -> tuple[Frame, Follower]:
-    """Compute the frame of a scene at a stage, by its name; return what follows it, too."""
+def _arms() -> ArmStore:
+    """Return the arms that a page has."""
     from dt_viz.folders import default_cache_folder  # noqa: PLC0415
     from dt_viz.learning.store import FitStore  # noqa: PLC0415
     from dt_viz.robot.models import load_jaco  # noqa: PLC0415
     from dt_viz.scenario.tasks import TASKS  # noqa: PLC0415
-    from dt_viz.session.engine import Engine  # noqa: PLC0415
+    from dt_viz.session.arms import ArmStore  # noqa: PLC0415
 
-    engine = Engine(TASKS, FitStore(default_cache_folder()), load_jaco())
-    frames = engine.frames(scenario(engine.task(task)))
-    return next(frame for frame in frames if frame.stage.name == stage), engine.follower
+    return ArmStore(TASKS, FitStore(default_cache_folder()), load_jaco())
 
 
-def _drawn(task: str, scenario: Callable[[Task], Scenario], suffix: str) -> bytes:
-    """Draw a scene as lines and text."""
+def _computed(saved: Saved, stage: str) -> tuple[Frame, Follower]:
+    """Compute the frame of a scenario at a stage, by its name; return what follows it, too."""
+    scenario, engine = saved.scenario, _arms().engine(saved.scenario.arm)
+    if saved.own is not None:
+        own, _gone = engine.bring(saved.own.task, "")
+        scenario = replace(scenario, task=own.name)
+    return next(frame for frame in engine.frames(scenario) if frame.stage.name == stage), engine.follower
+
+
+def _drawn(saved: Saved, suffix: str) -> bytes:
+    """Draw a scenario as lines and text."""
     from dt_viz.ui.scene.figure import render_figure  # noqa: PLC0415
 
-    frame, _follower = _computed(task, scenario, "FINE")
+    frame, _follower = _computed(saved, "FINE")
     return render_figure(frame, suffix)
 
 
-def _recorded(task: str, scenario: Callable[[Task], Scenario]) -> bytes:
-    """Record a scene as a page that plays it."""
+def _recorded(saved: Saved) -> bytes:
+    """Record a scenario as a page that plays it."""
+    import numpy as np  # noqa: PLC0415
+
     from dt_viz.ui.scene.recording import record  # noqa: PLC0415
 
-    return record(*_computed(task, scenario, "CERTIFIED"))
+    pose = saved.camera and (np.array(saved.camera[0]), np.array(saved.camera[1]))
+    return record(*_computed(saved, "CERTIFIED"), pose)
 
 
-def _rendered(
-    task: str, scenario: Callable[[Task], Scenario], size: tuple[int, int], browser: str, suffix: str, of: str
-) -> bytes:
-    """Have a browser render a scene, its arm in the middle of its motion, as the page saves it; or a video `of` it.
+def _rendered(saved: Saved, size: tuple[int, int], browser: str, suffix: str, of: str) -> bytes:
+    """Have a browser render a scenario, its arm in the middle of its motion, as the page saves it; or a video `of` it.
 
     Raises:
         FormatError: it is no browser, and ends.
@@ -195,9 +212,12 @@ def _rendered(
     from dt_viz.robot.models import load_jaco  # noqa: PLC0415
     from dt_viz.scenario.tasks import TASKS  # noqa: PLC0415
     from dt_viz.session.frame import Stage  # noqa: PLC0415
+    from dt_viz.session.session import CHOICES  # noqa: PLC0415
     from dt_viz.ui.server import Server  # noqa: PLC0415
 
-    server = Server(TASKS, FitStore(default_cache_folder()), load_jaco(), task=task, port=0)
+    begins, first = replace(saved, scenario=_at_rest(saved.scenario)), saved.scenario.task
+    fits, first = FitStore(default_cache_folder()), first if first in TASKS else next(iter(TASKS))
+    server = Server(TASKS, fits, load_jaco(), task=first, port=0, begins=begins)
     shrunk = min(1.0, SETTINGS.window / max(size))
     try:
         window = tuple(round(shrunk * side) for side in size)
@@ -207,18 +227,22 @@ def _rendered(
                 raise FormatError("Chromium", f"{browser!r}, which ended", "a browser that opens a page")
             visitor = server.visitors[0]
             session = visitor.session
-            session.load(task, lambda loaded: _at_rest(scenario(loaded)))
-            _until(lambda: session.wait_idle(0.1), "the motion")
+            _until(lambda: session.jobs.wait_idle(CHOICES, 0.1) and session.wait_idle(0.1), "the motion")
             frame = visitor.shown
-            if frame is None or frame.stage is not Stage.CERTIFIED:
-                raise TimeoutError(f"the page shows no motion of {task}")
+            wanted = replace(saved.scenario.choices, task="")
+            if (
+                frame is None
+                or frame.stage is not Stage.CERTIFIED
+                or replace(frame.scenario.choices, task="", passing=None) != wanted
+            ):
+                raise TimeoutError(f"the page shows no motion of {saved.scenario.task}")
             if frame.arm is not None:
                 visitor.robot.playback.live.put(frame.arm.q[round(SETTINGS.along * (len(frame.arm.q) - 1))])
             least = SETTINGS.smallest
             visitor.render_alone((least, least), SETTINGS.patience)  # the browser then has all that was sent
             time.sleep(SETTINGS.drawing)
             if suffix == ".png":
-                return visitor.render_alone(size, SETTINGS.patience)
+                return visitor.render_alone(size, SETTINGS.patience, saved.camera)
             return visitor.film(of.title(), suffix, size, lambda _part: None, never, alone=True)
     finally:
         server.close()

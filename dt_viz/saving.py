@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import json
 import os
-import zipfile
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -23,21 +24,23 @@ import numpy as np
 from dt_viz.avoidance import registry
 from dt_viz.avoidance.avoidance import SPACES, Avoidance
 from dt_viz.avoidance.transform import Transform
-from dt_viz.errors import DataError, FormatError, check_between, naming, parsing
+from dt_viz.errors import Cancelled, DataError, FormatError, check_between, naming, parsing
 from dt_viz.files.checks import read_bytes
-from dt_viz.files.npz import arrays_of, npz_bytes, write_whole
+from dt_viz.files.npz import Archive, arrays_of, check_types, npz_bytes, write_whole
+from dt_viz.files.uploads import read_upload
 from dt_viz.files.values import CLASS, packed, unpacked
 from dt_viz.learning.augmented import AugmentedImitation, fit_augmented
 from dt_viz.learning.demonstrations import MAX_COORDINATE, Demonstration, check_demonstrations
 from dt_viz.learning.imitation import Imitation
-from dt_viz.learning.inspection import Inspection
+from dt_viz.learning.inspection import Inspection, PreparationSettings
 from dt_viz.learning.interface import AnyImitation
 from dt_viz.learning.patterns import AugmentedSettings
 from dt_viz.learning.preparation import ImitationError
 from dt_viz.obstacles.shapes import SHAPES, Obstacle
 from dt_viz.scenario.own import Own
 from dt_viz.scenario.relocation import in_world
-from dt_viz.scenario.saved import Known, Saved, check_shapes, decode, encode, is_saved
+from dt_viz.scenario.saved import MAX_BYTES as MAX_SCENARIO
+from dt_viz.scenario.saved import MAX_PLAIN, Known, Saved, ScenarioError, check_shapes, decode, encode, is_saved
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.tasks import OWN, TASKS, Task, own_task
 
@@ -48,8 +51,12 @@ MAX_BYTES = 40 * 10**6
 """Largest number of bytes of a file, and of what it unpacks to."""
 KNOWN = Known(tuple(TASKS), arms=None, methods=None)
 """What scenarios may name."""
+MAX_SCENARIOS = 100
+"""Largest number of scenarios that a server offers."""
 TEXT, LEARNED = "motion", "imitation."
 """Name of the array that holds the text, and prefix of those of the imitation."""
+FIRST = f"{TEXT}.npy".encode()
+"""Name of a file's first member."""
 
 
 class MotionError(DataError):
@@ -105,13 +112,55 @@ def save_scenario(path: str | os.PathLike[str], saved: Saved) -> None:
     write_whole(path, content)
 
 
-def is_motion(path: Path) -> bool:
-    """Return whether a file says that it is a saved motion, whether or not it can be read."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return f"{TEXT}.npy" in archive.namelist()
-    except (OSError, zipfile.BadZipFile):
-        return False
+def is_scenario(path: Path) -> bool:
+    """Return whether a file says that it is a saved scenario, whether or not it can be read."""
+    is_small = path.is_file() and path.stat().st_size <= MAX_SCENARIO
+    return is_small and path.suffix.lower() == ".json" and is_saved(path.read_bytes())
+
+
+def read_scenario(path: Path, known: Known) -> Saved:
+    """Read a scenario from a file, with the surfaces of its obstacles, which take seconds.
+
+    Raises:
+        DataError: there is no such file, it is no scenario, or has a value that no page of these names gives.
+    """
+    with parsing(ScenarioError, path, "path", "a readable file"):
+        content = read_bytes(path, MAX_SCENARIO)
+    saved = decode(content, known, str(path))
+    check_shapes(saved.scenario, str(path))
+    return saved
+
+
+def read_scenarios(folder: Path, known: Known) -> tuple[Mapping[str, Saved], tuple[DataError, ...]]:
+    """Read the scenarios of a folder, by the names of their files without the suffix; return also what is refused.
+
+    Raises:
+        ScenarioError: it is no folder, or holds no .json file, or too many.
+    """
+    with parsing(ScenarioError, folder, "folder", "a readable folder"):
+        paths = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".json")
+        if not 1 <= len(paths) <= MAX_SCENARIOS:
+            raise FormatError("folder", f"{len(paths)} .json files", f"1 to {MAX_SCENARIOS} saved scenarios")
+    read, refused = dict[str, Saved](), list[DataError]()
+    for path in paths:
+        try:
+            if not re.fullmatch(r"[\w-]{1,60}", path.stem, re.ASCII):
+                accepted = "letters, digits, - and _, up to 60, as a link has them"
+                raise ScenarioError(path, "name", repr(path.stem)[:80], accepted)
+            read[path.stem] = read_scenario(path, known)
+        except DataError as error:
+            refused.append(error)
+    return read, tuple(refused)
+
+
+def is_motion(file: bytes | Path) -> bool:
+    """Return whether a file, its content or its path, says that it is a saved motion, whether or not it can be read."""
+    if isinstance(file, Path):
+        if not file.is_file():
+            return False
+        with file.open("rb") as opened:
+            file = opened.read(30 + len(FIRST))
+    return re.match(rb"PK\x03\x04.{26}" + FIRST, file, re.DOTALL) is not None
 
 
 def motion_task(path: Path) -> Task:
@@ -122,7 +171,28 @@ def motion_task(path: Path) -> Task:
     """
     with parsing(MotionError, path, "path", "a readable file"):
         content = read_bytes(path, MAX_BYTES)
-    saved, imitation = read_motion(content, path)
+    return _task_of(*read_motion(content, path), path)
+
+
+def sent_motion_task(name: str, content: bytes, cancelled: Cancelled) -> Task:
+    """Return a motion that a visitor has sent, the name and the content of its file, as a task of the page.
+
+    The archive is unpacked in another process. A motion in the augmented state is learned again in the time that
+    demonstrations take, as it has the settings that these are learned with.
+
+    Raises:
+        DataError: as `motion_task`, or it was learned with other settings.
+        UnwantedError: nobody wants it any more.
+    """
+    with parsing(MotionError, name, "file", "a file that Motion.save wrote"):
+        sent = read_upload(Archive, [(name, content)], cancelled, max_bytes=MAX_BYTES, max_text=MAX_PLAIN)
+        texts = {key: np.array(text) for key, text in sent.texts.items() if key == TEXT}
+        read = _read({**texts, **sent.numbers, **sent.integers}, name, as_usual=True)
+    return _task_of(*read, Path(name))
+
+
+def _task_of(saved: SavedMotion, imitation: AnyImitation, path: Path) -> Task:
+    """Return a motion as a task of the page. Raises DataError where it has what the page has not."""
     given = own_task(saved.demonstrations)
     task = replace(given, title=path.stem[:40], state=imitation.state, imitation=imitation, layers=saved.layers)
     with naming(MotionError, path):
@@ -152,30 +222,44 @@ def read_motion(content: bytes, source: str | Path) -> tuple[SavedMotion, AnyImi
         DataError: as :func:`load_motion`.
     """
     with parsing(MotionError, source, "file", "a file that Motion.save wrote"):
-        arrays = arrays_of(content, max_bytes=MAX_BYTES)
-        text = arrays.pop(TEXT, np.zeros(0))
-        if text.dtype.kind != "U" or text.ndim:
-            raise FormatError("arrays", "no text that describes a motion", "a file that Motion.save wrote")
-        plain = json.loads(str(text), object_hook=_from_before)
-        json.dumps(plain, ensure_ascii=False).encode()  # fails at half a character, which nothing could show
-        version = plain.pop("version", None) if isinstance(plain, dict) else None
-        if version != FORMAT:
-            raise FormatError("version", repr(version)[:40], f"{FORMAT}; another version of DT-Viz may have saved it")
-        for name, array in arrays.items():  # smaller numbers would grow eightfold when they are used
-            if array.dtype not in (np.float64, np.int64) and array.dtype.kind != "U":
-                raise FormatError(f"array {name[:40]!r}", f"values of type {array.dtype}", "float64, int64 or text")
-        classes = {Transform: registry.KINDS, Obstacle: SHAPES}
-        motion: SavedMotion = unpacked(plain, SavedMotion, "motion", arrays, classes)
-        learned = {name.removeprefix(LEARNED): array for name, array in arrays.items() if name.startswith(LEARNED)}
-        demonstrations = check_demonstrations(motion.demonstrations, source)
-        imitation = _again(motion) if motion.augmented else Imitation.from_arrays(learned)
-        if len(imitation.goal) != demonstrations[0].dimension:
-            found = f"{len(imitation.goal)}, and demonstrations in {demonstrations[0].dimension}"
-            raise FormatError("dimension of the imitation", found, "the same dimension")
-        for layer in motion.layers:
-            for obstacle in layer.transform.avoided.parts:
-                check_between("distance of an obstacle", float(np.linalg.norm(obstacle.position)), 0.0, MAX_COORDINATE)
-                check_between("length of its quaternion", float(np.linalg.norm(obstacle.wxyz)), 1e-3, 1e3)
+        return _read(arrays_of(content, max_bytes=MAX_BYTES), source)
+
+
+def _read(
+    arrays: Mapping[str, np.ndarray], source: str | Path, *, as_usual: bool = False
+) -> tuple[SavedMotion, AnyImitation]:
+    """Read a motion from the arrays of its file, `as_usual` one with the default settings of the augmented state.
+
+    Raises:
+        DataError, FormatError: it is none, or not so.
+        Exception: of almost any kind, on hostile texts.
+    """
+    arrays = dict(arrays)
+    text = arrays.pop(TEXT, np.zeros(0))
+    if text.dtype.kind != "U" or text.ndim:
+        raise FormatError("arrays", "no text that describes a motion", "a file that Motion.save wrote")
+    plain = json.loads(str(text), object_hook=_from_before)
+    json.dumps(plain, ensure_ascii=False).encode()  # fails at half a character, which nothing could show
+    version = plain.pop("version", None) if isinstance(plain, dict) else None
+    if version != FORMAT:
+        raise FormatError("version", repr(version)[:40], f"{FORMAT}; another version of DT-Viz may have saved it")
+    check_types(arrays)
+    classes = {Transform: registry.KINDS, Obstacle: SHAPES}
+    motion: SavedMotion = unpacked(plain, SavedMotion, "motion", arrays, classes)
+    learned = {name.removeprefix(LEARNED): array for name, array in arrays.items() if name.startswith(LEARNED)}
+    demonstrations = check_demonstrations(motion.demonstrations, source)
+    usual = AugmentedSettings(preparation=PreparationSettings(goal=motion.settings.preparation.goal))
+    if as_usual and motion.augmented and motion.settings != usual:
+        accepted = "the defaults on the page; the command line takes others"
+        raise FormatError("settings of the augmented state", "others", accepted)
+    imitation = _again(motion) if motion.augmented else Imitation.from_arrays(learned)
+    if len(imitation.goal) != demonstrations[0].dimension:
+        found = f"{len(imitation.goal)}, and demonstrations in {demonstrations[0].dimension}"
+        raise FormatError("dimension of the imitation", found, "the same dimension")
+    for layer in motion.layers:
+        for obstacle in layer.transform.avoided.parts:
+            check_between("distance of an obstacle", float(np.linalg.norm(obstacle.position)), 0.0, MAX_COORDINATE)
+            check_between("length of its quaternion", float(np.linalg.norm(obstacle.wxyz)), 1e-3, 1e3)
     return replace(motion, demonstrations=demonstrations), imitation
 
 

@@ -30,7 +30,7 @@ import trimesh
 from dt_viz import saving
 from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.avoidance.hand import Avoidance
-from dt_viz.errors import DataError, parsing
+from dt_viz.errors import DataError, never, parsing
 from dt_viz.files import uploads
 from dt_viz.files.recordings import Recordings
 from dt_viz.flows.diffeomorphisms import Integration
@@ -268,7 +268,7 @@ STACK = (
 LAYERS = tuple(Layer(transform, k == 0, f"Größe {k}") for k, transform in enumerate(STACK))
 
 
-def saved_motion() -> bytes:
+def saved_motion(layers: tuple[Layer, ...] = LAYERS) -> bytes:
     """A small motion, saved."""
     s = np.linspace(0, 1, 20)
     arcs = [np.stack([s - 1, (1 + 0.1 * k) * s * (1 - s)], axis=1) for k in range(2)]
@@ -276,8 +276,16 @@ def saved_motion() -> bytes:
     imitation = fit(demonstrations, ImitationSettings(num_layers=2, num_points=12, max_iterations=2))
     with TemporaryDirectory() as folder:
         path = Path(folder) / "a.npz"
-        save_motion(path, SavedMotion(demonstrations, LAYERS), imitation)
+        save_motion(path, SavedMotion(demonstrations, layers), imitation)
         return path.read_bytes()
+
+
+def sent_motion() -> bytes:
+    """One that a page shows: its names and its settings are the page's."""
+    hand, bias = STACK
+    assert isinstance(hand, Avoidance)
+    hand = replace(hand, integration=Integration())
+    return saved_motion((Layer(bias, name="Bias 1"), Layer(hand, name="Avoidance")))
 
 
 @cache
@@ -366,6 +374,7 @@ def seeds() -> tuple[tuple[str, str, bytes, tuple[Mutation, ...]], ...]:
         ("cloud", "a.ply", "\n".join(cloud).encode(), ()),
         *recorded_seeds(),
         ("motion", "a.npz", saved_motion(), (*(with_changed_members,) * 4, *(with_changed_text,) * 20)),
+        ("sent", "a.npz", sent_motion(), (*(with_changed_members,) * 4, *(with_changed_text,) * 20)),
     )
 
 
@@ -396,6 +405,9 @@ def read(kind: str, name: str, content: bytes) -> None:
         return
     if kind == "motion":
         saving.read_motion(content, name)
+        return
+    if kind == "sent":
+        saving.sent_motion_task(name, content, never)
         return
     if kind == "scenario":
         saved = decode(content, Known(tuple(TASKS)), name)

@@ -168,7 +168,9 @@ class NoFrames:
 class Page:
     """A visitor's page on a server that nobody looks at, and what a browser may send to it."""
 
-    def __init__(self, server: viser.ViserServer, robot: Any, arms: Any = None, kept: Any = None) -> None:
+    def __init__(
+        self, server: viser.ViserServer, robot: Any, arms: Any = None, kept: Any = None, **offered: Any
+    ) -> None:
         self.gui, self.scene = server.gui, server.scene
         self.camera = CameraClient().camera
         self.client = SimpleNamespace(
@@ -185,7 +187,8 @@ class Page:
         )
         self.gui._resolve_client = lambda _id: self.client  # type: ignore[method-assign]
         self.scene._get_client_handle = lambda _id: self.client  # type: ignore[method-assign]
-        self.visitor = Visitor(cast(Any, self.client), cast(Engine, NoFrames()), robot, TITLES, "draw_s", arms)
+        engine = cast(Engine, NoFrames())
+        self.visitor = Visitor(cast(Any, self.client), engine, robot, TITLES, "draw_s", arms, **offered)
         self._loop = asyncio.new_event_loop()
         self.session = self.visitor.session
         self._initial = self.session.scenario

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from contextlib import AsyncExitStack
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,10 @@ from demo import PATIENCE, address, started
 from dt_viz.cli import main
 from dt_viz.evaluate.protocol_client import LostError, ProtocolClient
 from dt_viz.learning import store
-from dt_viz.scenario.tasks import TASKS
+from dt_viz.scenario.own import Own
+from dt_viz.scenario.saved import Saved, encode
+from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.tasks import OWN, TASKS, own_task
 from dt_viz.ui import server
 from dt_viz.ui.patches import GateError
 from dt_viz.ui.server import CLOSING
@@ -115,6 +119,90 @@ def test_own_files_are_the_task_that_the_page_begins_with(monkeypatch, tmp_path,
     assert "it would be ready" in capsys.readouterr().err
     assert main([str(tmp_path), "--columns", "x,y"]) == 2
     assert "0.csv: columns: found 2 names for 3 columns; accepted: 3 names" in capsys.readouterr().err
+
+
+def served(monkeypatch, capsys, *arguments):
+    """What the server would be given, and what is printed."""
+    given = {}
+
+    def serve(tasks, *_what, **how):
+        given.update(how, tasks=tasks)
+        raise GateError("it would be ready")
+
+    monkeypatch.setattr(server, "Server", serve)
+    assert main([*map(str, arguments), "--port", "0", "--processes", "1"]) == 2
+    return given, capsys.readouterr().err
+
+
+OWN_SAVED = Saved(Scenario(OWN, (), warp=0.5), own=Own.of(own_task(TASKS["push_box"]().demonstrations)))
+
+
+def test_a_saved_scenario_is_what_each_page_begins_with(monkeypatch, tmp_path, capsys):
+    path = tmp_path / "mine.json"
+    path.write_text(encode(Saved(Scenario("draw_j", (), warp=0.5))))
+    given, _ = served(monkeypatch, capsys, path)
+    assert (given["task"], given["begins"]) == ("draw_j", Saved(Scenario("draw_j", (), warp=0.5)))
+    path.write_text(encode(OWN_SAVED))
+    given, _ = served(monkeypatch, capsys, path)
+    task = given["tasks"][OWN]()
+    assert (given["task"], task.name, len(task.paths)) == (OWN, OWN, len(TASKS["push_box"]().paths))
+    assert given["begins"] == Saved(Scenario(OWN, (), warp=0.5))
+    path.write_text(encode(replace(OWN_SAVED, scenario=replace(OWN_SAVED.scenario, arm="panda"))))
+    given, _ = served(monkeypatch, capsys, path)  # its arm brings it, where it is placed for that
+    assert given["task"] == "draw_s" and OWN not in given["tasks"] and given["begins"].own is not None
+
+
+@pytest.mark.parametrize(
+    ("change", "arguments", "said"),
+    [
+        (('"warp":0.5', '"warp":7.0'), (), "mine.json: warp: found 7; accepted: 0 to 1"),
+        (('"arm":""', '"arm":"pr2"'), (), "mine.json: arm: found 'pr2'"),
+        (('"arm":""', '"arm":""' + 300_000 * " "), (), "mine.json: "),
+        (
+            ("", ""),
+            ("--task", "draw_s"),
+            "mine.json: --task: found an option beside a saved scenario; accepted: the sc",
+        ),
+        (
+            ("", ""),
+            ("mine.json",),
+            "mine.json: files: found a saved scenario among 2 files; accepted: it alone, or --scenarios",
+        ),
+        (("", ""), ("takes.csv",), "mine.json: files: found a saved scenario among 2 files; accepted: it alone"),
+    ],
+)
+def test_a_scenario_that_cannot_be_opened_is_one_line(monkeypatch, tmp_path, capsys, change, arguments, said):
+    monkeypatch.chdir(tmp_path)
+    old, new = change
+    (tmp_path / "mine.json").write_text(encode(OWN_SAVED).replace(old, new, 1))
+    given, error = served(monkeypatch, capsys, "mine.json", *arguments)
+    assert not given and error.startswith(f"dt-viz: {said}") and error.count("\n") == 1
+
+
+def test_scenarios_of_a_folder_are_offered_by_their_names_and_each_that_is_refused_is_a_line(
+    monkeypatch, tmp_path, capsys
+):
+    text = encode(OWN_SAVED)
+    for name in ("lesson-1", "Lesson_2", "a b", "ä", "x" * 61):
+        (tmp_path / f"{name}.json").write_text(text)
+    (tmp_path / "damaged.json").write_text(text.replace('"warp":0.5', '"warp":7.0'))
+    (tmp_path / "other.json").write_text("[1, 2]")
+    (tmp_path / "takes.csv").write_text("no scenario")
+    given, error = served(monkeypatch, capsys, "--scenarios", tmp_path)
+    assert [*given["scenarios"]] == ["Lesson_2", "lesson-1"] and given["begins"] is None
+    assert given["scenarios"]["lesson-1"].scenario == OWN_SAVED.scenario
+    *refused, _served = error.splitlines()
+    assert len(refused) == 5 and all(": found " in line for line in refused)
+    assert any("damaged.json: warp: found 7; accepted: 0 to 1" in line for line in refused)
+    assert sum(": name: found " in line for line in refused) == 3
+
+
+@pytest.mark.parametrize(("num", "said"), [(0, "found 0 .json files; accepted: 1 to 100"), (101, "found 101 .json")])
+def test_a_folder_without_scenarios_or_with_very_many_is_refused(tmp_path, capsys, num, said):
+    for k in range(num):
+        (tmp_path / f"{k}.json").touch()
+    assert main(["--scenarios", str(tmp_path)]) == 2
+    assert said in capsys.readouterr().err
 
 
 def test_handlers_of_signals_are_as_before_when_it_returns(capsys):

@@ -10,6 +10,11 @@ from PIL import Image
 
 from dt_viz.cli import main
 from dt_viz.picture import SETTINGS
+from dt_viz.scenario.own import Own
+from dt_viz.scenario.saved import Saved, encode
+from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.tasks import OWN, TASKS, own_task
+from dt_viz.session.arms import ArmStore
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of matplotlib's own parts
 
@@ -19,6 +24,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of matp
     [
         (("nowhere", "--out", "f.png"), "SCENE: found 'nowhere'; accepted: lift, push, "),
         (("", "--out", "f.svg"), "SCENE: found ''; accepted: lift, push, "),
+        (("a.json", "--out", "f.svg"), "a.json: path: found no such file; accepted: a readable file"),
         (("draw_s", "--out", "f.png", "--size", "0x0"), "--size: found '0x0'; accepted: WIDTHxHEIGHT, each 64 to 7680"),
         (("draw_s", "--out", "f.png", "--size", "1920x100000"), "--size: found '1920x100000'; accepted"),
         (("draw_s", "--out", "f.png", "--size", "large"), "--size: found 'large'; accepted"),
@@ -70,6 +76,25 @@ def test_a_scene_and_a_step_of_the_tour_are_drawn_as_lines_and_text(tmp_path, ca
     assert all(f">{title}</text>" in svg for title in ("base attractor", "imitation", "+ avoidance", "rollouts"))
     assert main(["picture", "tour-4", "--out", str(tmp_path / "g.svg")]) == 0
     assert ">obstacle</text>" in (tmp_path / "g.svg").read_text()
+
+
+def test_a_saved_scenario_is_recorded_with_its_demonstrations_its_arm_and_its_camera(
+    tmp_path, cache, monkeypatch, capsys
+):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
+    made, recorded, engine = [], [], ArmStore.engine
+    monkeypatch.setattr(ArmStore, "engine", lambda store, name: made.append(name) or engine(store))
+    monkeypatch.setattr("dt_viz.ui.scene.recording.record", lambda *given: recorded.append(given) or b"page")
+    own, sight = own_task(TASKS["push_box"]().demonstrations[:3]), ((0.4, -2.2, 1.4), (0.2, -0.3, 0.2))
+    text = encode(Saved(Scenario(OWN, (), arm="panda"), sight, Own.of(own)))
+    (tmp_path / "a.json").write_text(text)
+    assert main(["picture", str(tmp_path / "a.json"), "--out", str(tmp_path / "f.html")]) == 0
+    ((frame, _follower, pose),) = recorded
+    assert made == ["panda"] and np.array_equal(pose, sight)
+    assert frame.task.demonstrations[0].positions.tobytes() == own.demonstrations[0].positions.tobytes()
+    (tmp_path / "a.json").write_text(text.replace('"warp":1.0', '"warp":7.0'))
+    assert main(["picture", str(tmp_path / "a.json"), "--out", str(tmp_path / "g.html")]) == 2
+    assert "a.json: warp: found 7; accepted: 0 to 1\n" in capsys.readouterr().err
 
 
 @needs_chromium

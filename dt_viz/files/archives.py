@@ -20,11 +20,15 @@ from dt_viz.files.trees import complex_numbers, tables_of
 
 LASA_UNITS = {"length": 1e-3, "time": 1.0}
 """Units of the LASA handwriting data: millimetres and seconds."""
+ALONE = "recordings; this file is opened alone"
+"""What is accepted in place of a saved motion or a saved scenario."""
 
 
 def read_npz(path: Path, options: ReadOptions) -> Iterator[Table]:
     """Read named arrays; ``times_i``, ``positions_i`` and ``name_i``, as this program writes them, are metres."""
     arrays = arrays_of(path, max_bytes=LIMITS.bytes)
+    if "motion" in arrays and arrays["motion"].dtype.kind == "U":
+        raise FormatError("file", "a motion that the library has saved", ALONE)
     ours = all(re.fullmatch(r"(?:times|positions|orientations_wxyz|name)_\d+", key) for key in arrays)
     timed, placed = (
         {key.rpartition("_")[2] for key in arrays if key.startswith(f"{part}_")} for part in ("times", "positions")
@@ -75,7 +79,10 @@ def read_mat(path: Path, options: ReadOptions) -> Iterator[Table]:
 def read_json(path: Path, options: ReadOptions) -> Iterator[Table]:
     """Read lists of numbers, records with named fields, or mappings of them."""
     check_size(path.stat().st_size, LIMITS.text)
-    yield from tables_of(json.loads(path.read_bytes()), path.stem, options.joint_names)
+    tree = json.loads(path.read_bytes())
+    if isinstance(tree, Mapping) and tree.get("class") == "Saved":
+        raise FormatError("file", "a scenario that the page has saved", ALONE)
+    yield from tables_of(tree, path.stem, options.joint_names)
 
 
 def read_parquet(path: Path, options: ReadOptions) -> Iterator[Table]:

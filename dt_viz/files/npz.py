@@ -7,17 +7,32 @@ import logging
 import os
 import threading
 import zipfile
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
 from dt_viz.errors import FormatError
+from dt_viz.files.checks import check_at_most
+from dt_viz.numerics import Array, Indices
 
 logger = logging.getLogger(__name__)
 T = TypeVar("T")
+MAX_ARRAYS = 10_000
+"""Largest number of arrays of an archive from a visitor."""
+
+
+@dataclass(frozen=True, eq=False)
+class Archive:
+    """Arrays of an archive from a visitor, by their names; see `read_archive`."""
+
+    numbers: Mapping[str, Array]
+    integers: Mapping[str, Indices]
+    texts: Mapping[str, str]
+    """Texts; arrays of several are left out."""
 
 
 def arrays_of(content: bytes | Path, *, max_bytes: int, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
@@ -47,6 +62,34 @@ def arrays_of(content: bytes | Path, *, max_bytes: int, names: Collection[str] |
             if not isinstance(arrays[name], np.ndarray):  # numpy gives other members as their bytes
                 raise FormatError(f"array {name[:40]!r}", "another member", accepted)
     return arrays
+
+
+def read_archive(files: Sequence[tuple[str, bytes]], max_bytes: int, max_text: int) -> Archive:
+    """Read the arrays of one archive, its name and its content, in the process of `dt_viz.files.worker`.
+
+    Raises:
+        FormatError: it unpacks to more than `max_bytes`, a text has more than `max_text` characters, or there are other
+            values than float64, int64 and text.
+        Exception: as `arrays_of`.
+    """
+    ((_name, content),) = files
+    arrays = arrays_of(content, max_bytes=max_bytes)
+    check_at_most("arrays", len(arrays), MAX_ARRAYS)
+    texts = {name: str(array) for name, array in arrays.items() if array.dtype.kind == "U" and not array.ndim}
+    for name, text in texts.items():
+        check_at_most(f"array {name[:40]!r}", len(text), max_text, "characters")
+    check_types(arrays)
+    numbers, integers = (
+        {name: array for name, array in arrays.items() if array.dtype == kind} for kind in (np.float64, np.int64)
+    )
+    return Archive(numbers, integers, texts)
+
+
+def check_types(arrays: Mapping[str, np.ndarray]) -> None:
+    """Raise FormatError where an array has smaller numbers, which would grow eightfold when they are used."""
+    for name, array in arrays.items():
+        if array.dtype not in (np.float64, np.int64) and array.dtype.kind != "U":
+            raise FormatError(f"array {name[:40]!r}", f"values of type {array.dtype}", "float64, int64 or text")
 
 
 def npz_bytes(arrays: Mapping[str, Any]) -> bytes:

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from dt_viz.errors import FormatError
+from dt_viz.files.npz import Archive, read_archive
 from dt_viz.files.processes import stand_back
 from dt_viz.files.recordings import Recordings, read_recordings
 from dt_viz.files.shapes import Points, Triangles, read_points, read_triangles
@@ -37,6 +38,7 @@ READERS: Mapping[str, Callable[..., Any]] = {
     Triangles.__name__: read_triangles,
     Points.__name__: read_points,
     Recordings.__name__: read_recordings,
+    Archive.__name__: read_archive,
 }
 """Readers of names and contents, by the class of what they give."""
 

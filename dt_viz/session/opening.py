@@ -22,6 +22,7 @@ from dt_viz.learning.preparation import ImitationError, Motions, NoCommonGoalErr
 from dt_viz.robot.inverse_kinematics import UnreachableError
 from dt_viz.robot.placement import Placement, fitting, follows, resampled
 from dt_viz.robot.robot import Robot
+from dt_viz.saving import sent_motion_task
 from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.tasks import OWN, Task, TaskEntry, own_task
 from dt_viz.session.tasks_in_reach import in_reach
@@ -140,6 +141,18 @@ def read(
     name = files[0][0] if len(files) == 1 else f"{len(files)} files"
     with parsing(DemonstrationError, name, "file", "recorded motions"):
         return read_upload(Recordings, files, cancelled, answers=answers, joint_names=[*robot.joint_names])
+
+
+def read_motion(name: str, content: bytes, robot: Robot, cancelled: Cancelled = never) -> Task:
+    """Read a saved motion, the name and the content of its file, as a task; a drawing is placed in the arm's reach.
+
+    Raises:
+        DataError: it cannot be read, or has what the page has not.
+        UnwantedError: nobody wants it any more.
+    """
+    task = sent_motion_task(name, content, cancelled)
+    is_drawing = task.demonstrations[0].dimension == 2
+    return in_reach({OWN: TaskEntry(task.title, lambda: task, not is_drawing)}, robot)[OWN]()
 
 
 def preview(recordings: Recordings, choices: Choices, robot: Robot, taught: Sequence[Taught] = ()) -> Preview:

@@ -211,7 +211,13 @@ class ControlPanel:
         )
 
     def _learn(self, session: Session, task: Task) -> None:
-        self.begin(lambda session, _title: session.choose_task(self._bring(session, task)), session, task.title)
+        """Begin with a task of the visitor's own: with the present choices, or as a saved motion begins."""
+
+        def begin(session: Session, _title: str) -> None:
+            choose = session.choose_task if task.imitation is None else session.begin_task
+            choose(self._bring(session, task))
+
+        self.begin(begin, session, task.title)
 
     def _bring(self, session: Session, task: Task, arm: str | None = None) -> str:
         """Take a task of the visitor's own; return its name. See `Session.bring`."""
@@ -259,18 +265,22 @@ class ControlPanel:
         else:
             session.say(f"“{title}” is made for the JACO: choose it in Arm → Model.", Severity.WARNING)
 
-    def follow(self, session: Session, link: Link) -> None:
-        """Begin the scene, the task or the tour that a link asks for; where there is none, say so."""
+    def follow(self, session: Session, link: Link, scenarios: Mapping[str, Callable[[], None]]) -> None:
+        """Begin the scene, the task, the tour or the scenario that a link asks for; where there is none, say so."""
         scene = found(link.name, self._scenes.values()) if link.kind == "scene" else None
         names = {"scene": [each.name for each in self._scenes.values()], "task": self._titles, "tour": NUMBERS}
+        names["scenario"] = scenarios
         if scene is not None:
             self.begin(self._load, session, scene.title)
         elif link.kind == "task" and link.name in self._titles:
             self.begin(lambda session, _title: session.begin_task(link.name), session, self._titles[link.name])
         elif link.kind == "tour" and link.name in ("", *NUMBERS):
             self.tour.take(session, int(link.name or 1) - 1)
+        elif link.kind == "scenario" and link.name in scenarios:
+            scenarios[link.name]()
         else:
-            text = f"The link: {link.kind}: found {link.name!r}; accepted: {', '.join(names[link.kind])}"
+            accepted = ", ".join(names[link.kind])[:200] or "none: this server offers none"
+            text = f"The link: {link.kind}: found {link.name!r}; accepted: {accepted}"
             session.say(text, Severity.WARNING)
 
     def begin(self, begin: Callable[[Session, str], None], session: Session, title: str) -> None:

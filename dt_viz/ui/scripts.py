@@ -17,12 +17,14 @@ from __future__ import annotations
 import html
 import re
 import secrets
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from urllib.parse import unquote
 
 import viser
 
+from dt_viz.scenario.saved import Saved
 from dt_viz.ui import patches
 
 FOLDER = "window"
@@ -163,7 +165,7 @@ Where nothing is kept it stays in the address.
 FORGET = "try { sessionStorage.removeItem('dt-viz-present'); } catch {}"
 """Keeps the key no longer."""
 
-KINDS = ("scene", "task", "tour")
+KINDS = ("scene", "task", "tour", "scenario")
 """Kinds of things that a link may ask for."""
 
 
@@ -174,7 +176,7 @@ class Link:
     kind: str
     """One of `KINDS`."""
     name: str
-    """Name of a scene or a task, or number of a step of the tour, from 1; the first one if empty."""
+    """Name of a scene, a task or a scenario, or number of a step of the tour, from 1; the first one if empty."""
 
 
 Told = Callable[[str, "float | Link | Claim"], None]
@@ -184,7 +186,9 @@ Told = Callable[[str, "float | Link | Claim"], None]
 class Ruler:
     """Measures the window of one visitor, and reads its link."""
 
-    def __init__(self) -> None:
+    def __init__(self, scenarios: Mapping[str, Saved] = MappingProxyType({})) -> None:
+        """Make one whose link may name these scenarios."""
+        self.scenarios = scenarios
         self.token = secrets.token_urlsafe(12)
         """Name of this ruler in requests, which nobody else knows."""
 

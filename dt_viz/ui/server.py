@@ -9,6 +9,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import NoReturn
 
 import viser
@@ -16,6 +17,7 @@ import viser
 from dt_viz.accounts import Accounts
 from dt_viz.learning.store import FitStore
 from dt_viz.robot.robot import Robot
+from dt_viz.scenario.saved import Saved
 from dt_viz.scenario.tasks import TaskEntry
 from dt_viz.serving.board import Share, own_share
 from dt_viz.serving.listening import listen
@@ -66,6 +68,8 @@ class Server:
         max_of_address: int | None = None,
         allowed: Sequence[Origin] = (),
         key: str | None = None,
+        begins: Saved | None = None,
+        scenarios: Mapping[str, Saved] = MappingProxyType({}),
     ) -> None:
         """Listen and wait for visitors.
 
@@ -84,6 +88,8 @@ class Server:
                 with a key, as a lecture hall may have one address.
             allowed: origins of other pages that may connect; see `Origins`.
             key: makes all visitors watch the one who has it; see `Lecture`. Without one each has a private scene.
+            begins: scenario of each new visitor, whose names these tasks and arms have; None is as the task begins.
+            scenarios: scenarios that links may name, such as `/?scenario=lesson-1`, with such names, too.
 
         Raises:
             AddressError: the address is not available.
@@ -93,7 +99,16 @@ class Server:
         titles, arms = {name: entry.title for name, entry in tasks.items()}, ArmStore(tasks, fits, robot)
         accounts = Accounts()
         self._new_visitor: Callable[[viser.ClientHandle], Visitor] = lambda client: Visitor(
-            client, arms.engine(), robot, titles, task, arms, self._share, accounts.opened(self.gate.address(client))
+            client,
+            arms.engine(),
+            robot,
+            titles,
+            task,
+            arms,
+            self._share,
+            accounts.opened(self.gate.address(client)),
+            begins,
+            scenarios,
         )
         self._lock = threading.Condition()
         self._visitors: dict[int, Visitor | None] = {}

@@ -8,6 +8,7 @@ from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
+from types import MappingProxyType
 
 import numpy as np
 import viser
@@ -39,7 +40,7 @@ from dt_viz.ui.keeping import Keeper
 from dt_viz.ui.panel import ControlPanel
 from dt_viz.ui.pen import Pen
 from dt_viz.ui.playback import Playback, Replay
-from dt_viz.ui.scene.camera import CameraController, Framing, Pose, shot_of, view_of
+from dt_viz.ui.scene.camera import CameraController, Framing, Pose, shot_beside, shot_of, view_of
 from dt_viz.ui.scene.export import RESOLUTIONS, TIMEOUT, render_frame, render_png
 from dt_viz.ui.scene.film import MOTION, SETTINGS, TURNTABLE, Film, Rendering, encoded, motion, turntable, warping
 from dt_viz.ui.scene.key import Key
@@ -72,6 +73,11 @@ def initial(task: Task) -> Scenario:
     return replace(scenario, stack=with_avoidance(scenario, obstacles=(sphere,)))
 
 
+def known_names(tasks: Collection[str], arms: Collection[str]) -> Known:
+    """Return the names that a scenario may have on a page of these tasks and arms."""
+    return Known(tasks, arms, tuple(method.name for method in OTHERS))
+
+
 def _takes_long(saved: Saved) -> bool:
     """Whether another arm, surfaces of obstacles, or a task are to be made for a scenario before it is shown."""
     shapes = any(isinstance(obstacle, TriangleObstacle) for obstacle in saved.scenario.obstacles)
@@ -100,10 +106,14 @@ class Visitor(Display):
         arms: ArmStore | None = None,
         share: Share | None = None,
         account: Account | None = None,
+        begins: Saved | None = None,
+        scenarios: Mapping[str, Saved] = MappingProxyType({}),
     ) -> None:
         """Build the page for an engine of its own and start computing; there is one arm where there are no `arms`.
 
-        Edits and pictures are counted in the `share` of this process, processor time in the visitor's `account`.
+        Where the browser keeps nothing, the page `begins` with a scenario, or else as the task does; a link may name
+        one of the `scenarios`. Edits and pictures are counted in the `share` of this process, processor time in the
+        visitor's `account`.
         """
         self.client = client
         self.shown: Frame | None = None
@@ -119,8 +129,7 @@ class Visitor(Display):
         self._studio = Studio(self.pictures, lambda: self.robot, self._changing)
         titled = {"": robot.title} if arms is None else arms.titles
         pen = Pen(self.pictures, lambda: self.robot, lambda: self.session, self._face)
-        methods = tuple(method.name for method in OTHERS)
-        self._keeper = Keeper(client.local_storage, Known(titles, titled, methods), self._made)
+        self._keeper = Keeper(client.local_storage, known_names(titles, titled), self._made)
         self._camera = CameraController(client, lambda: self.robot.hand, robot.size, self._keeper.changed)
         self._panel = ControlPanel(
             client.gui,
@@ -146,14 +155,20 @@ class Visitor(Display):
             client.local_storage,
             self._came_back,
         )
+        later = begins if self._keeper.begun is None else None
+        if later is not None and not _takes_long(later):
+            self._keeper.go_on(later)
+            later = None
         begun = self._keeper.begun
         at_once = None if begun is None or _takes_long(begun) else begun.scenario
         display = self if share is None else Counted(self, share)
         self.session = Session(engine, initial_scenario, task, display, arms and arms.engine, at_once, account)
         self._panel.connect(self.session)
         self._keeper.begin(self.session, self._resume)
+        if later is not None:
+            self._resume(later)
         self._panel.tour.begin(self.session)
-        self.ruler = Ruler()
+        self.ruler = Ruler(scenarios)
         """What the visitor's window is measured with."""
         self.robot.playback.begin(self.session.jobs, self.session.fail)
         keep_ready(self)
@@ -165,7 +180,8 @@ class Visitor(Display):
     def told(self, what: float | Link) -> None:
         """Take the width of the window, CSS pixels, or begin what the link of the page asks for."""
         if isinstance(what, Link):
-            self._panel.follow(self.session, what)
+            offered = self.ruler.scenarios.items()
+            self._panel.follow(self.session, what, {name: partial(self._resume, saved) for name, saved in offered})
         else:
             self._camera.measured(what)
 
@@ -342,12 +358,18 @@ class Visitor(Display):
                 lambda: render_png(self.client, size, shot, legends, 2 * TIMEOUT, transparent=transparent), BROWSER
             )
 
-    def render_alone(self, size: tuple[int, int], timeout: float) -> bytes:
-        """Render the scene that is shown as `render` does, but framed in all of the picture; `timeout` in seconds."""
+    def render_alone(self, size: tuple[int, int], timeout: float, sight: Sight | None = None) -> bytes:
+        """Render the scene that is shown as `render` does, but framed in all of the picture; `timeout` in seconds.
+
+        With a `sight` it is what a camera that looks so shows beside the panel, in a window of the usual size.
+        """
         self.robot.playback.advance(0.0)
         self.client.flush()
         with self._studio.rendering():
-            shot = shot_of(self._pose_alone(size))
+            pose = self._pose_alone(size) if sight is None else (np.array(sight[0]), np.array(sight[1]))
+            shot = shot_of(pose)
+            if sight is not None:
+                shot = shot_beside(pose, shot.wxyz, Framing(), size)
             return render_png(self.client, size, shot, self._legends, timeout, transparent=False)
 
     def _pose_alone(self, size: tuple[int, int]) -> Pose:

@@ -8,7 +8,8 @@ from browsing import DROP, PATIENCE, UNHURRIED, close_notices, close_page, kept,
 from chromium import needs_chromium
 
 from dt_viz.scenario.paper_scenes import SCENES
-from dt_viz.scenario.saved import is_saved
+from dt_viz.scenario.saved import Saved, is_saved
+from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui.server import Server
 
@@ -18,7 +19,8 @@ pytestmark = [pytest.mark.browser, needs_chromium]
 @pytest.fixture(scope="module")
 def another(fits, robot):
     """Another server."""
-    server = Server(TASKS, fits, robot, task="push_box", port=0, max_sessions=2)
+    lesson = Saved(Scenario("draw_j", (), warp=0.5))
+    server = Server(TASKS, fits, robot, task="push_box", port=0, max_sessions=2, scenarios={"lesson-1": lesson})
     yield server
     server.close()
 
@@ -100,6 +102,17 @@ def test_a_link_begins_what_it_names_and_a_reload_goes_on_with_what_was_made_of_
     second = visitor()
     assert second.session.scenario.warp == 0.5
     close_page(page, server, second)
+
+
+def test_a_link_opens_a_saved_scenario_that_the_server_offers(browser, another):
+    known, page = set(another.visitors), new_page(browser)
+    page.goto(f"http://127.0.0.1:{another.port}/?scenario=lesson-1")
+    wait_until(lambda: set(another.visitors) - known, "the page of a visitor")
+    (visitor,) = set(another.visitors) - known
+    wait_until(
+        lambda: (visitor.session.scenario.task, visitor.session.scenario.warp) == ("draw_j", 0.5), "the scenario"
+    )
+    close_page(page, another, visitor)
 
 
 def test_a_link_to_nothing_says_what_there_is_and_the_page_opens(browser, server):

@@ -192,8 +192,26 @@ def instances() -> bytes:
     return glb(scene | {"scenes": [{"nodes": list(range(5000))}]}, vertices + faces)
 
 
+def many_arrays() -> bytes:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        for k in range(50_000):
+            archive.writestr(f"{k}.npy", npz_member(0))
+    return file.getvalue()
+
+
+def of_motion(text: str) -> bytes:
+    file = io.BytesIO()
+    np.savez_compressed(file, motion=np.array(text))
+    return file.getvalue()
+
+
 ATTACKS = {
     "a member that bzip2 packs": ("cloud", "a.npz", bzip2_member, "bytes when unpacked"),
+    "a motion that bzip2 packs": ("sent", "a.npz", bzip2_member, "bytes when unpacked"),
+    "a motion of very many arrays": ("sent", "a.npz", many_arrays, "arrays: found 50000"),
+    "a motion of much text": ("sent", "a.npz", lambda: of_motion("{}," * 3_000_000), "found 9000000 characters"),
+    "a motion of lists in lists": ("sent", "a.npz", lambda: of_motion("[" * 290_000), "found"),
     "a directory that lies": ("cloud", "a.npz", lying_header, "found"),
     "text in an archive": ("mesh", "a.3mf", full_of_text, "bytes when unpacked"),
     "a mesh in very many places": ("mesh", "a.glb", instances, "faces: found more than 500000 of all parts"),
@@ -225,9 +243,10 @@ def test_what_takes_gigabytes_is_refused_in_the_readers_process(program, attack)
 
 
 def test_mutated_files_are_read_or_refused(program):
-    """Two of each kind, and thirty of those that are read in the user's own process."""
+    """Two of each kind, and thirty of those that are used in the user's own process, or in the server's."""
     kinds = [kind for kind, *_ in seeds()]
-    own = (k for k in range(30 * len(kinds)) if k < 2 * len(kinds) or kinds[k % len(kinds)] == "demonstrations")
+    many = "demonstrations", "sent"
+    own = (k for k in range(30 * len(kinds)) if k < 2 * len(kinds) or kinds[k % len(kinds)] in many)
     read_all(program, [*own], MAX_GROWTH)
 
 

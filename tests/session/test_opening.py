@@ -5,8 +5,10 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from other_arms import five_joints
 from scipy.spatial.transform import Rotation
 
+import dt_viz as dt
 from dt_viz.files.recordings import Recordings
 from dt_viz.files.takes import Take
 from dt_viz.flows.rotations import quaternions
@@ -20,7 +22,7 @@ from dt_viz.scenario.tasks import TASKS, own_task
 from dt_viz.session.engine import MOST_OWN, NOT_TURNED, Engine
 from dt_viz.session.frame import Stage
 from dt_viz.session.history import History
-from dt_viz.session.opening import Choices, preview, with_reach
+from dt_viz.session.opening import Choices, preview, read_motion, with_reach
 
 GOAL = np.array([0.2, -0.45, 0.3])
 RNG = np.random.default_rng(3)
@@ -48,6 +50,14 @@ def six(goal_of_last=GOAL):
     paths[1] = np.concatenate([paths[1][:100], np.repeat(paths[1][100:101], 80, axis=0), paths[1][100:]])
     paths[2] = paths[2] + RNG.normal(scale=0.002, size=paths[2].shape)
     return Recordings(tuple(take(f"take {k}", path) for k, path in enumerate(paths)))
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_saved_drawing_is_put_where_the_arm_follows_it_and_a_motion_in_space_stays(robot, tmp_path, dim):
+    paths = [motion(np.array([-0.2, -0.4, 0.2 + 0.01 * k]))[:, :dim] for k in range(3)]
+    dt.fit(paths, state="augmented", rate=50).save(tmp_path / "a.npz")
+    tasks = [read_motion("a.npz", (tmp_path / "a.npz").read_bytes(), arm) for arm in (robot, five_joints())]
+    assert [len(task.moves) for task in tasks] == [0, dim == 2]
 
 
 def kinds(seen, number):

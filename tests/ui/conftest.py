@@ -25,10 +25,10 @@ def opened_for(server, robot):
     """Opens pages for browsers."""
     pages = []
 
-    def opens(browser: Any) -> Page:
+    def opens(browser: Any, **offered: Any) -> Page:
         server.gui.reset()
         server.scene.reset()
-        pages.append(Page(server, robot, kept=browser))
+        pages.append(Page(server, robot, kept=browser, **offered))
         return pages[-1]
 
     yield opens

@@ -4,6 +4,7 @@ import threading
 import time
 from dataclasses import replace
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 import pytest
@@ -14,16 +15,17 @@ from scenes import changed, starts_at
 from dt_viz.obstacles.shapes import Box, MeshObstacle, Sphere
 from dt_viz.obstacles.solids import Solid
 from dt_viz.obstacles.surfaces import box_surface
+from dt_viz.scenario.own import Own
 from dt_viz.scenario.paper_scenes import SCENES
 from dt_viz.scenario.saved import MAX_BYTES, Known, Saved, decode, encode
 from dt_viz.scenario.scenario import Scenario
-from dt_viz.scenario.tasks import TASKS, own_task
+from dt_viz.scenario.tasks import OWN, TASKS, own_task
 from dt_viz.session.frame import Stage
 from dt_viz.session.session import CHOICES
 from dt_viz.ui import keeping, panel
 from dt_viz.ui.keeping import KEY, LANE, PAUSE
 from dt_viz.ui.scene.camera import view_of
-from dt_viz.ui.scripts import Link
+from dt_viz.ui.scripts import Link, told
 from dt_viz.ui.tabs.status import verdict
 from dt_viz.ui.visitor import initial_scenario
 
@@ -417,6 +419,47 @@ def test_a_link_begins_its_task_afresh_also_where_that_is_what_was_kept_and_undo
     page.visitor.told(Link("scene", "fig-4"))
     assert page.session.jobs.wait_idle(CHOICES, PATIENCE)
     assert (page.session.scenario.scene, page.session.scenario.task) == ("two_points", "draw_j")
+
+
+# --- scenarios of the server ---
+
+
+def own_of(task: str = "draw_j") -> Saved:
+    """A scenario of demonstrations of one's own."""
+    return Saved(Scenario(OWN, (), warp=0.5), own=Own.of(own_task(TASKS[task]().demonstrations)))
+
+
+def test_a_new_visitor_begins_with_the_servers_scenario_and_one_who_was_here_with_his_own(opened_for):
+    begins, browser = Saved(MADE, SIGHT), Browser()
+    page = opened_for(browser, begins=begins)
+    assert page.session.scenario == MADE and message(page) == ""
+    assert page.visitor._keeper.sight(frame_of(MADE, task=None)) == SIGHT
+    settled(page)
+    assert browser.told == []
+    mine = replace(MADE, warp=0.25)
+    assert opened_for(Browser(**{KEY: made(scenario=mine)}), begins=begins).session.scenario == mine
+
+
+@pytest.mark.parametrize("kind", [Browser, Blocked])
+def test_a_new_visitor_begins_with_the_servers_demonstrations_once(opened_for, kind):
+    page = opened_for(kind(), begins=own_of())
+    assert page.session.jobs.wait_idle(CHOICES, PATIENCE)
+    settled(page)
+    assert (page.session.scenario.task, page.session.scenario.warp) == ("own_data_1", 0.5)
+    assert page["Task"].value == "Your data"
+
+
+def test_a_link_opens_a_scenario_that_the_server_offers_by_its_name(opened_for):
+    page = opened_for(Browser(), scenarios={"lesson-1": Saved(MADE, SIGHT), "lesson-2": own_of()})
+    for name, task in (("lesson-1", MADE.task), ("lesson-2", "own_data_1"), ("../lesson-1", "own_data_1")):
+        _token, link = told(f"/window/a/scenario/{quote(name, safe='')}") or ("", 0.0)
+        page.visitor.told(link)
+        assert page.session.jobs.wait_idle(CHOICES, PATIENCE)
+        assert page.session.scenario.task == task
+    assert message(page) == "The link: scenario: found '../lesson-1'; accepted: lesson-1, lesson-2"
+    page = opened_for(Browser())
+    page.visitor.told(Link("scenario", ""))
+    assert message(page) == "The link: scenario: found ''; accepted: none: this server offers none"
 
 
 # --- the camera ---

@@ -1,6 +1,7 @@
 """The folder "Your data": what is opened is seen, chosen about, and learned by a click; nothing forged gets through."""
 
 import io
+import json
 import math
 import zipfile
 from dataclasses import replace
@@ -10,7 +11,12 @@ import pytest
 import viser  # noqa: TID251 - forges what a browser sends
 from pages import PATIENCE, Page, frame_of, wait_until
 
+import dt_viz as dt
 from dt_viz.files import uploads
+from dt_viz.files.npz import npz_bytes
+from dt_viz.files.values import packed
+from dt_viz.motion.stack import FINE
+from dt_viz.saving import SavedMotion, is_motion
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.progress import Progress
 from dt_viz.session.session import CHOICES
@@ -31,11 +37,11 @@ def csv(goal=GOAL, timed=True, jitter=0.0, size=1.0, num=200):
     return "\n".join([header, *(",".join(f"{value:.6f}" for value in row) for row in rows)]).encode()
 
 
-def zipped(**files):
+def zipped(suffix=".csv", **files):
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w") as archive:
         for name, content in files.items():
-            archive.writestr(f"{name}.csv", content)
+            archive.writestr(f"{name}{suffix}", content)
     return file.getvalue()
 
 
@@ -259,6 +265,94 @@ def test_the_folder_goes_again_with_a_first_file_that_cannot_be_read(opened):
     assert not folder.visible
     opened.add("b.csv", csv())
     assert folder.visible and opened.num_drawn == 1
+
+
+# --- motions that the library has saved ---
+
+
+def arcs(dim=3):
+    """Demonstrations of a motion in space, or of a drawing."""
+    s = np.linspace(0, 1, 40)
+    start = np.array([-0.2, -0.4, 0.3])[:dim]
+    for k in range(7):
+        path = np.stack([0.35 * s, (0.4 + 0.02 * k) * s * (1 - s), 0.1 * s**2], axis=1)[:, :dim]
+        yield dt.Demonstration(2 * s, start + path, f"arc {k}")
+
+
+QUICK = dt.ImitationSettings(num_layers=2)
+MOTIONS = {
+    "in space": lambda: dt.fit([*arcs()], settings=QUICK, state="plain").stack(
+        dt.BiasPoint((0.0, -0.25, 0.3)), dt.Avoidance(dt.Sphere((-0.02, -0.31, 0.33), 0.08), margin=0.01)
+    ),
+    "augmented, with labels of its own": lambda: dt.fit([*arcs()], labels=[0, 1, 0, 1, 0, 1, 0]).stack(
+        dt.Avoidance(dt.Box((-0.02, -0.31, 0.33), (0.05, 0.1, 0.08)))
+    ),
+}
+
+
+def content_of(motion, folder):
+    motion.save(folder / "my_motion.npz")
+    return (folder / "my_motion.npz").read_bytes()
+
+
+@pytest.mark.parametrize("name", MOTIONS)
+def test_a_saved_motion_is_the_same_on_the_page(opened, tmp_path, new_engine, name):
+    motion = MOTIONS[name]()
+    opened.add("anything.bin", content_of(motion, tmp_path))
+    session = opened.page.session
+    assert opened.told == [] and len(session.task.demonstrations) == 7 and opened["Task"].value == "Your data"
+    assert session.scenario.stack[0].transform == motion.transforms[0]
+    engine = new_engine()
+    engine.bring(session.task, "draw_s")
+    solved = engine.solved(session.scenario, FINE)
+    assert solved.stack.bundle.positions.tobytes() == motion.solution.bundle.positions.tobytes()
+    session.undo()
+    assert session.scenario.task == "draw_s"
+
+
+def test_a_saved_drawing_is_on_the_board_with_its_obstacles_and_without_any_it_has_the_sphere(opened, tmp_path):
+    box = dt.Box((0.0, -0.3, 0.0), (0.05, 0.1, 0.08))
+    plain = dt.fit([*arcs(2)], settings=QUICK, state="plain")
+    opened.add("a.npz", content_of(plain.stack(dt.Avoidance(box)), tmp_path))
+    session = opened.page.session
+    (there,) = session.scenario.obstacles
+    np.testing.assert_allclose(there.position, session.task.to_world(np.array([0.0, -0.3])))
+    assert session.task.draws
+    opened.add("b.npz", content_of(plain, tmp_path))
+    assert session.scenario.task == "own_data_2" and isinstance(session.scenario.obstacles[0], dt.Sphere)
+
+
+def refused_motions():
+    """Motions that are not read, by what is said of them."""
+    ball, plain = dt.Sphere((-0.02, -0.31, 0.33), 0.08), MOTIONS["in space"]()
+    slow = dt.AugmentedSettings(num_paces=10**7)
+    yield plain.stack(dt.Avoidance(ball)), "transforms 'Avoidance': found 2; accepted: at most 1"
+    saved = SavedMotion(tuple(arcs()), (), augmented=True, settings=slow)
+    yield saved, "settings of the augmented state: found others; accepted: the defaults on the page"
+    far = dt.Demonstration(np.arange(3.0), 1e3 * np.eye(3), "far")
+    yield SavedMotion((far,), (), augmented=True), "positions of 'far': found 1000 m"
+
+
+def test_a_motion_that_is_not_read_is_one_line_and_changes_nothing(opened, tmp_path):
+    opened.add("good.csv", csv())
+    before, good = opened.page.session.scenario, content_of(MOTIONS["in space"](), tmp_path)
+    contents = []
+    for motion, said in refused_motions():
+        if isinstance(motion, SavedMotion):
+            text = {"version": 1, **packed(motion, "motion", arrays := {})}
+            contents.append((npz_bytes({"motion": np.array(json.dumps(text))} | arrays), said))
+        else:
+            contents.append((content_of(motion, tmp_path), said))
+    for content, said in (
+        *contents,
+        (good[: len(good) // 2], "file: found something that cannot be read"),
+        (npz_bytes({"motion": np.array("[" * 300_001)}), "array 'motion': found 300001 characters; accepted: at most"),
+        (zipped(".npz", a=good, b=good), "a motion that the library has saved; accepted: recordings; this file is op"),
+    ):
+        opened.told.clear()
+        opened.add("a.npz" if content[:2] != b"PK" or is_motion(content) else "a.zip", content)
+        assert len(opened.told) == 1 and said in opened.told[0] and "\n" not in opened.told[0]
+        assert opened.page.session.scenario is before and opened.num_drawn == 1
 
 
 def test_another_task_ends_what_is_open(opened):

@@ -4,6 +4,7 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from dt_viz.session.frame import Stage
 from dt_viz.session.progress import Pace
@@ -86,3 +87,16 @@ def test_a_picture_is_saved_in_light_colours_and_the_dark_theme_stays(page, monk
     assert taken == [(light, None)] and colours(page) == dark != light
     assert np.array_equal(grounds[-1], background(DARK))
     choose(page, False)
+
+
+def test_a_picture_by_itself_looks_as_a_saved_camera_beside_the_panel(page, monkeypatch):
+    shots, (position, look_at) = [], np.array([[1.0, -2.0, 1.5], [0.1, -0.3, 0.2]])
+    monkeypatch.setattr(page.client, "get_render", lambda *_size, **how: shots.append(how) or np.zeros((2, 2, 4), "u1"))
+    page.visitor.render_alone((1280, 720), 1.0, (tuple(position), tuple(look_at)))
+    (shot,) = shots
+    right, _down, ahead = Rotation.from_quat(np.roll(shot["wxyz"], -1)).as_matrix().T
+    depth = np.linalg.norm(look_at - position)
+    np.testing.assert_allclose(ahead, (look_at - position) / depth)
+    offset = shot["position"] - position
+    np.testing.assert_allclose(offset, (offset @ right) * right, atol=1e-9)
+    assert -0.3 * depth < offset @ right < 0

@@ -16,6 +16,7 @@ from dt_viz.files.takes import READERS
 from dt_viz.learning.demonstrations import WRITERS
 from dt_viz.learning.inspection import FindingKind
 from dt_viz.obstacles.files import MESH_SUFFIXES
+from dt_viz.saving import is_motion
 from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.tasks import Task
 from dt_viz.session import opening
@@ -80,7 +81,8 @@ class OpenPanel:
         self._seen: Preview | None = None
         """What is shown of it."""
         hint = (
-            f"a saved scenario; demonstrations of your own: {FORMATS}, several at once, or a zip of a folder; "
+            "a saved scenario; a motion that the library has saved; "
+            f"demonstrations of your own: {FORMATS}, several at once, or a zip of a folder; "
             f"a mesh: {', '.join(suffix[1:] for suffix in MESH_SUFFIXES)}"
         )
         self.upload = gui.add_upload_button("Open a file, or drop it here", icon=viser.Icon.FOLDER_OPEN, hint=hint)
@@ -167,6 +169,8 @@ class OpenPanel:
             size = sum(len(each) for _, each in files)
             if session.jobs.busy(LANE):
                 session.say("A file of yours is being read; open the next one after it.", Severity.WARNING)
+            elif is_motion(content):
+                session.jobs.submit(LANE, partial(self._read_motion, name, content))
             elif size > self._most:
                 accepted = f"at most {self._most / 1e6:.0f} MB; the command line takes more"
                 session.say(f"{name}: files: found {size / 1e6:.1f} MB in all; accepted: {accepted}", Severity.ALARM)
@@ -232,6 +236,24 @@ class OpenPanel:
         else:
             self._change(opened.files, recordings=known, num_read=len(opened.files))
             session.jobs.submit(SEEING, self._see, latest=True)
+        finally:
+            self.upload.disabled = False
+
+    def _read_motion(self, name: str, content: bytes) -> None:
+        """Begin with a saved motion, in place of what is open, or say why that cannot be.
+
+        Raises:
+            UnwantedError: the visitor has left.
+        """
+        session, self.upload.disabled = self._bindings.session, True
+        left = partial(session.jobs.superseded, LANE)
+        try:
+            with turn(session.say, left):
+                task = opening.read_motion(name, content, session.robot, left)
+        except DataError as error:
+            session.say(str(error), Severity.ALARM)
+        else:
+            self._learn(session, task)
         finally:
             self.upload.disabled = False
 
