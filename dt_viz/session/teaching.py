@@ -10,14 +10,14 @@ from scipy.interpolate import CubicSpline
 from scipy.linalg import eigh, solveh_banded
 
 from dt_viz.errors import FormatError, naming
-from dt_viz.files.takes import Take
 from dt_viz.flows.fields import Array, Mask
-from dt_viz.learning.demonstrations import DemonstrationError
+from dt_viz.learning.demonstrations import Demonstration, DemonstrationError, check_demonstrations
 from dt_viz.metrics import arc_length, resample_by_arc_length
 from dt_viz.robot.placement import REFERENCE_SHOULDER
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.tasks import DRAWING_AXES, DRAWING_CENTRE
+from dt_viz.scenario.taught import Taught
 
 
 @dataclass(frozen=True)
@@ -75,18 +75,6 @@ class Stroke:
         return np.array(self.places).reshape(-1, 3)
 
 
-@dataclass(frozen=True, eq=False)
-class Taught:
-    """A take that was taught."""
-
-    take: Take
-    """What is kept of it: of a board in its coordinates, of the hand in space."""
-    drawn: Array
-    """(N, 3) places of the pointer, metres."""
-    board: Slice | None = None
-    """Board that it was drawn on; None was guided in space."""
-
-
 def board_of(robot: Robot) -> Slice:
     """Return the board of an arm: the drawing plane of the tasks, scaled about its shoulder by its size."""
     centre = robot.shoulder + robot.size * (DRAWING_CENTRE - REFERENCE_SHOULDER)
@@ -103,13 +91,13 @@ def taught(name: str, stroke: Stroke, board: Slice | None = None) -> Taught:
     """Keep a stroke, drawn on a board or guided in space, as a take of a name.
 
     Raises:
-        DemonstrationError: there are too few points, they hardly move, or they are not finite.
+        DemonstrationError: there are too few points, they hardly move, are not finite, or go too far or too long.
     """
     points = stroke.points
     with naming(DemonstrationError, name):
         times, kept = smoothed(np.array(stroke.moments), points if board is None else board.across(points))
-    units = {"length": 1.0, "time": 1.0, "angle": 1.0}
-    return Taught(Take(name, times, kept, None, None, (), units), points, board)
+    (demonstration,) = check_demonstrations([Demonstration(times, kept, name)], name)
+    return Taught(demonstration, points, board)
 
 
 def smoothed(times: Array, points: Array, settings: TeachingSettings = SETTINGS) -> tuple[Array, Array]:

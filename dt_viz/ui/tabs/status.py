@@ -180,7 +180,8 @@ def remedy(frame: Frame, progress: Progress) -> Remedy | None:
         return Remedy("Complete the warp", {"warp": 1.0})
     found = concerns(frame, wanted.view)
     mends = None if frame.blocked or not found else _against(found[0].kind.mend, found[0].source, wanted)
-    return UNDO if mends is None and progress.steps[0] and (frame.blocked or found) else mends
+    undoes = progress.steps[0] and progress.beside is None
+    return UNDO if mends is None and undoes and (frame.blocked or found) else mends
 
 
 def _against(mend: Mend | None, source: str, scenario: Scenario) -> Remedy | None:
@@ -377,7 +378,7 @@ class StatusLine:
             (fraction, text), severity = progress.learning, Severity.NOTE
             below = progress_html(fraction)
         self._told, frame = progress, progress.shown
-        self.steps.content = steps_html(progress.steps)
+        self.steps.content = steps_html(progress.steps if progress.beside is None else progress.beside)
         mends = None
         if frame is not None and progress.message is None and not progress.stale:
             mends = remedy(frame, progress)
