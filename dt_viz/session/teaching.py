@@ -11,7 +11,7 @@ from scipy.linalg import eigh, solveh_banded
 
 from dt_viz.errors import FormatError, naming
 from dt_viz.flows.fields import Array, Mask
-from dt_viz.learning.demonstrations import Demonstration, DemonstrationError, check_demonstrations
+from dt_viz.learning.demonstrations import Demonstration, DemonstrationError
 from dt_viz.metrics import arc_length, resample_by_arc_length
 from dt_viz.robot.placement import REFERENCE_SHOULDER
 from dt_viz.robot.robot import Robot
@@ -96,8 +96,7 @@ def taught(name: str, stroke: Stroke, board: Slice | None = None) -> Taught:
     points = stroke.points
     with naming(DemonstrationError, name):
         times, kept = smoothed(np.array(stroke.moments), points if board is None else board.across(points))
-    (demonstration,) = check_demonstrations([Demonstration(times, kept, name)], name)
-    return Taught(demonstration, points, board)
+        return Taught(Demonstration(times, kept, name), points, board).checked(name)
 
 
 def smoothed(times: Array, points: Array, settings: TeachingSettings = SETTINGS) -> tuple[Array, Array]:

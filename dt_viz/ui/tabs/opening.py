@@ -18,7 +18,7 @@ from dt_viz.learning.inspection import FindingKind
 from dt_viz.obstacles.files import MESH_SUFFIXES
 from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.tasks import Task
-from dt_viz.scenario.taught import MAX_TAKES
+from dt_viz.scenario.taught import MAX_TAKES, Lesson
 from dt_viz.session import opening
 from dt_viz.session.history import Beside
 from dt_viz.session.opening import LENGTHS, USUAL_RATES, Choices, Opened, Preview
@@ -95,7 +95,7 @@ class OpenPanel:
             cancel = gui.add_button("Cancel", color="gray")
         self.controls["learn"] = self.control(start, lambda _pressed: self._press())
         self.control(cancel, lambda _pressed: self.close())
-        bindings.show(lambda s: (s.task, s.scene), lambda _chosen: self.close())
+        bindings.show(lambda s: (s.task, s.scene), lambda _chosen: self.close(keeps=True))
         bindings.show(lambda s: s.arm, lambda _arm: self._again())
         bindings.show(lambda _: None if bindings.frame is None else bindings.frame.task, self._learned)
 
@@ -147,17 +147,20 @@ class OpenPanel:
         dropdown("topic", "Topic", (NO_COLUMN,), partial(self._answer, "topic"), "of the bag, or frame, of the hand")
         return found
 
-    def close(self, *, learns: bool = False) -> None:
+    def close(self, *, keeps: bool = False, learns: bool = False) -> None:
         """Let go of what is open, and show what was shown before, or what it `learns` once that is known.
 
-        What was taught is kept until then: learning may be cancelled, or fail.
+        What was taught and is not learned yet is kept for the next time if it `keeps` or `learns` it: learning may be
+        cancelled, or fail.
         """
         with self._changing:
             if not self.folder.visible:
                 return
             self.folder.visible = False
-            kept = self._opened if learns and self._opened.taught else Opened()
+            kept = self._opened if (keeps or learns) and self._opened.taught else Opened()
             seen, self._seen, self._opened = self._seen, None, kept
+            frame = self._bindings.frame
+            self._learned(None if frame is None else frame.task)
             self._draw()
             self._put_beside()
             if seen is not None:
@@ -203,6 +206,17 @@ class OpenPanel:
                 self._open(Opened.again(task.lesson, task.preparation))
             else:
                 self._open(self._opened)
+
+    def reopen(self, lesson: Lesson) -> None:
+        """Open takes that were taught before, in place of what is open; Undo brings others back."""
+        before = self.lesson
+        self._open(replace(Opened.again(lesson), past=() if before is None else (before,)))
+
+    @property
+    def lesson(self) -> Lesson | None:
+        """What is taught and not learned yet, as it is without files; None if that is nothing."""
+        opened = self._opened
+        return Lesson(opened.taught, () if opened.files else opened.lesson.left_out) if opened.taught else None
 
     def _open(self, opened: Opened) -> None:
         """Open what was opened and taught before."""

@@ -22,7 +22,7 @@ from dt_viz.scenario.stack import (
     with_transform,
 )
 from dt_viz.session.frame import Frame, Stage
-from dt_viz.session.progress import Pace, Progress
+from dt_viz.session.progress import Message, Pace, Progress
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.scene.palette import Colour, ink, paper
@@ -366,6 +366,11 @@ class StatusLine:
         self.steps = gui.add_html(steps_html((False, False)))
         bindings.on(self.cancel, lambda session, _pressed: session.cancel())
         bindings.on(self.mend, lambda session, _pressed: self._mend(session))
+
+    @property
+    def message(self) -> Message | None:
+        """The message that was told last; None if none was, or it has passed."""
+        return None if self._told is None else self._told.message
 
     def tell(self, progress: Progress) -> None:
         """Show what is known of what is wanted; called by one thread after the other."""
