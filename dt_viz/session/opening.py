@@ -27,7 +27,7 @@ from dt_viz.scenario.tasks import OWN, Task, TaskEntry, own_task
 from dt_viz.scenario.taught import Lesson, Taught
 from dt_viz.session.history import MAX_UNDO
 from dt_viz.session.tasks_in_reach import in_reach
-from dt_viz.session.teaching import crosses_itself, drawn_beyond
+from dt_viz.session.teaching import SETTINGS, crosses_itself, drawn_beyond
 from dt_viz.warning import in_metres
 
 LENGTHS = tuple(unit for unit, (kind, _) in UNITS.items() if kind == "length")
@@ -208,10 +208,13 @@ def preview(recordings: Recordings, choices: Choices, robot: Robot, taught: Sequ
     seen = _inspected(used, choices, robot, board)
     drawn = tuple(each.drawn for each in taught)
     beyond = tuple(drawn_beyond(robot, drawn))
+    long = [f"{each.name} ({each.kept.duration:.0f} s)" for each in taught if each.kept.duration > SETTINGS.longest]
+    kept = f"{SETTINGS.most_points} points are used, evenly chosen: what is quicker than these is lost"
+    said += (f"of takes longer than {SETTINGS.longest:.0f} s, {', '.join(long)}, {kept}",) * bool(long)
     if taught and seen.task is not None:  # the plain state takes seconds, and cannot cross
         left_out = () if recordings.takes[: -len(taught)] else tuple(sorted(choices.left_out))
         seen = replace(seen, task=replace(seen.task, state="augmented", lesson=Lesson(tuple(taught), left_out)))
-        crossing = [each.name for each in taught if each.board is not None and crosses_itself(each.kept.positions)]
+        crossing = [each.name for each in taught if crosses_itself(each.kept.positions)]
         which = "the augmented state, which remembers the phase, can"
         said += (f"what crosses itself ({', '.join(crossing)}) no plain motion follows: {which}",) * bool(crossing)
     return replace(seen, unit=unit, rate=rate, notes=said, drawn=drawn, beyond=beyond)

@@ -31,7 +31,7 @@ class TeachingSettings:
     standing: float = 0.15
     """Time without a point from which on the pointer stood still, seconds."""
     most_points: int = 300
-    """Largest number of points that a spline is fitted to; of more, evenly chosen ones are used."""
+    """Largest number of points that a spline is fitted to; of more, evenly chosen ones are used, which is said."""
     most_recorded: int = 4096
     """Number of points at which every second one of a take that is still being made is dropped."""
     least_points: int = 5
@@ -44,6 +44,11 @@ class TeachingSettings:
     """Weight of the degrees of freedom in generalised cross-validation; above 1 fewer splines follow noise."""
     board: tuple[float, float] = (0.32, 0.28)
     """Half the width and height of the board, metres, for an arm as large as the JACO."""
+
+    @property
+    def longest(self) -> float:
+        """Duration up to which all points of a take are used, seconds."""
+        return self.most_points * self.interval
 
 
 SETTINGS = TeachingSettings()
@@ -165,19 +170,21 @@ def _without_noise(times: Array, points: Array, settings: TeachingSettings) -> A
 
 
 def crosses_itself(path: Array, num: int = 41) -> bool:
-    """Return whether a plane path (N, 2), of which so many points are looked at, crosses itself.
+    """Return whether a path (N, d), of which so many points are looked at, crosses itself in the plane or in space.
 
-    Two of its pieces lie on both sides of each other then; smaller loops, as of a pen that stands, are not seen.
+    Two of its pieces cross where both are seen along their common normal; in space they are nearer to each other than
+    a piece is long. Smaller loops, as of a pen that stands, are not seen.
     """
-    coarse = resample_by_arc_length(path, num)
-    a, b = coarse[:-1], coarse[1:]
-
-    def sides(points: Array) -> Array:
-        along, to = (b - a)[:, None], points[None] - a[:, None]
-        return along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0]
-
-    apart = sides(a) * sides(b) < 0
-    return bool((apart & apart.T).any())
+    coarse = resample_by_arc_length(np.pad(path, [(0, 0), (0, 3 - path.shape[1])]), num)
+    i, j = np.triu_indices(num - 1, k=2)  # neighbours touch
+    pieces, between = np.diff(coarse, axis=0), coarse[j] - coarse[i]
+    normal, lengths = np.cross(pieces[i], pieces[j]), np.linalg.norm(pieces, axis=1)
+    square = (normal**2).sum(axis=1)
+    skew = square > 1e-12 * (lengths[i] * lengths[j]) ** 2  # parallel pieces have no common normal
+    i, j, between, normal, square = (part[skew] for part in (i, j, between, normal, square))
+    along_i, along_j = ((np.cross(between, pieces[k]) * normal).sum(axis=1) / square for k in (j, i))
+    near = np.abs((between * normal).sum(axis=1)) < lengths.max() * np.sqrt(square)
+    return bool((near & (along_i > 0) & (along_i < 1) & (along_j > 0) & (along_j < 1)).any())
 
 
 def drawn_beyond(robot: Robot, paths: Sequence[Array]) -> list[Array]:

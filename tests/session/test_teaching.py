@@ -166,6 +166,34 @@ def test_what_crosses_itself_is_said_and_learned(robot, fits):
     assert learned.imitation.state == "augmented"
 
 
+def in_space(kind, depth=0.0):
+    """A path in space that is a curve as seen along a direction, and as deep along it, (N, 3), metres."""
+    u = np.linspace(0, 1, 100)
+    flat = np.concatenate([curve(u, kind), depth * u[:, None]], axis=1)
+    return flat @ np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0] + [0.0, -0.4, 0.4]
+
+
+def test_what_is_guided_across_itself_is_said_too_and_passing_far_behind_is_no_crossing(robot):
+    assert [crosses_itself(in_space(kind)) for kind in ("S", "8")] == [False, True]
+    assert [crosses_itself(in_space("8", depth)) for depth in (0.02, 0.5)] == [True, False]
+    there_and_back = np.abs(np.linspace(-1, 1, 100))[:, None] * [0.1, 0.2, 0.3]
+    assert not crosses_itself(there_and_back)
+    for kind, crosses in (("S", False), ("8", True)):
+        hand = Stroke([*np.linspace(0, T, 100)], [*in_space(kind)])
+        seen = opening.preview(Recordings(), Choices(), robot, [taught("guided 1", hand)])
+        assert any("crosses itself (guided 1)" in note for note in seen.notes) == crosses
+
+
+def test_a_take_of_which_points_are_left_out_for_its_length_is_named(robot):
+    board = board_of(robot)
+    for duration, thinned in ((SETTINGS.longest - 0.5, False), (SETTINGS.longest + 5.0, True)):
+        times = np.arange(0, duration, SETTINGS.interval)
+        long = taught("drawn 1", Stroke([*times], [*board.at(curve(times / times[-1]))]), board)
+        seen = opening.preview(Recordings(), Choices(), robot, [long])
+        assert any("drawn 1 (20 s), 300 points" in note for note in seen.notes) == thinned
+        assert (len(times) > SETTINGS.most_points) == thinned
+
+
 def test_places_out_of_reach_are_red_and_the_take_is_scaled_if_that_is_wanted(robot):
     board = board_of(robot)
     away = board.centre + np.array([0.0, -0.55, 0.0])  # of the arm
