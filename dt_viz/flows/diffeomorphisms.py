@@ -249,7 +249,6 @@ class Placed(Diffeomorphism):
 
 Method = Literal["auto", "rk4", "euler"]
 """`auto` keeps the result exact to a tolerance; the others take equal steps, Euler's being the paper's."""
-METHODS: tuple[Method, ...] = ("auto", "rk4", "euler")
 MAX_STEPS, MOST_STEPS = 50, 1000
 """Largest numbers of steps of a flow: on the page, and at all."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import threading
 import time
 from collections.abc import Callable
@@ -28,8 +27,6 @@ from dt_viz.session.history import Beside, History
 from dt_viz.session.jobs import Jobs
 from dt_viz.session.progress import Display, Edits, Screen
 from dt_viz.warning import Severity
-
-logger = logging.getLogger(__name__)
 
 HABITS = ("playing", "replay", "speed", "joint_plots", "health_plots", "large_plots")
 """Fields of the view that are a visitor's way of working, and stay when a scene of the paper comes or goes."""

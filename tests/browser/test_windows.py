@@ -115,6 +115,42 @@ def test_the_presentation_has_a_caption_and_buttons_in_place_of_the_panel(visit)
     page.get_by_label("Task", exact=True).wait_for()
 
 
+LEAVES = """tab => {
+    const root = tab.closest('[role=tablist]').parentElement;
+    const scrolls = node => getComputedStyle(node).overflowX === 'visible' ? scrolls(node.parentElement) : node;
+    const found = [];
+    let number = 0;
+    const kinds = 'label, button:not([role=tab]), [class*=Button-label], input, th, td, p';
+    for (const node of root.querySelectorAll(kinds)) {
+        const box = node.getBoundingClientRect();
+        if (!node.checkVisibility({opacityProperty: true, visibilityProperty: true}) || box.width < 4) continue;
+        const around = scrolls(node.parentElement).getBoundingClientRect();
+        const name = node.innerText || node.getAttribute('aria-label') || node.value || node.tagName;
+        if (box.left < Math.max(around.left, 0) - 1 || box.right > Math.min(around.right, innerWidth) + 1)
+            found.push(`${name} is cut`);
+        if (node.scrollWidth > node.clientWidth + 1 && node.clientWidth) found.push(`${name} is too narrow`);
+        number += 1;
+    }
+    return number < 3 ? ['nothing is there'] : found;
+}"""
+"""What is cut at its sides, or too narrow for its content, of a tab's controls, wherever these are scrolled to."""
+TABS = ("World", "Stack", "Show", "Arm", "Compare", "Picture")
+
+
+def faults_of(page, tab):
+    """Faults of a tab of the panel."""
+    open_tab(page, tab)
+    return page.get_by_role("tab", name=tab, exact=True).evaluate(LEAVES)
+
+
+@windows(PHONE, PHONE_ON_ITS_SIDE, LAPTOP, PROJECTOR)
+def test_nothing_of_any_tab_is_cut_or_too_narrow(visit):
+    page, _ = visit
+    for tab in TABS:
+        wait_until(lambda tab=tab: faults_of(page, tab) == [], f"{tab} to be whole")
+    open_tab(page, "World")
+
+
 SPOILT = {
     "Task is cut": "input {margin-left: 120px}",
     "name of Imitate is cut": "label {position: relative; left: -60px}",
@@ -122,7 +158,11 @@ SPOILT = {
     "status is cut": "[role=status] {margin-left: 200px !important; width: 300px}",
     "Scene overlaps name of Scene": "input {position: relative; left: -90px}",
 }
-"""What the check must find, and the style that does it."""
+SPOILT_TAB = {
+    "Presentation is cut": "button {margin-left: 150px}",
+    "Presentation is too narrow": "button {width: 70px !important}",
+}
+"""What the checks must find, and the style that does it."""
 
 
 @pytest.mark.parametrize("visit", [PROJECTOR], indirect=True, ids=str)
@@ -133,6 +173,11 @@ def test_the_check_finds_what_is_cut_or_overlaps(visit):
         assert fault in faults(boxes(page))
         spoiling.evaluate("element => element.remove()")
     assert faults(boxes(page)) == []
+    for fault, style in SPOILT_TAB.items():
+        spoiling = page.add_style_tag(content=style)
+        assert fault in faults_of(page, "Picture")
+        spoiling.evaluate("element => element.remove()")
+    open_tab(page, "World")
 
 
 def touch(page, start, end, steps=6):
