@@ -30,6 +30,7 @@ from dt_viz.ui.bindings import EDITS, Bindings
 from dt_viz.ui.controls import Control
 from dt_viz.ui.panel import ControlPanel
 from dt_viz.ui.scene.camera import HOME, CameraController, Framing, view_of, window_size
+from dt_viz.ui.tabs.opening import CHOOSING
 from dt_viz.ui.visitor import Visitor
 from dt_viz.warning import Severity
 
@@ -281,6 +282,8 @@ class Page:
 
     def busy(self, **view: Any) -> Scenario:
         """A scenario in which most controls are shown, and most things stand in the scene; all else is as at first."""
+        assert self.session.jobs.wait_idle(CHOOSING, PATIENCE)
+        self.visitor._panel.opening.close()
         obstacles = (Cylinder(MIDDLE, 0.08, 0.16), Box(MIDDLE, (0.1, 0.1, 0.1)), Sphere(MIDDLE))
         avoidance = {"space": "cspace", "duration": 0.5, "integration": Integration("rk4", 8)}
         layers = biases(BiasPoint(MIDDLE, radius=0.1, strength=0.5))

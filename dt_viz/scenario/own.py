@@ -17,6 +17,7 @@ from dt_viz.learning.inspection import PreparationSettings
 from dt_viz.learning.interface import State
 from dt_viz.scenario.scenario import MAX_DISTANCE
 from dt_viz.scenario.tasks import Move, Task, own_task
+from dt_viz.scenario.taught import Lesson
 
 MAX_MOVES = 20
 """Largest number of times that a task is placed."""
@@ -43,20 +44,22 @@ class Own:
     """State that it is learned in where none is asked for."""
     learned: Mapping[str, Array] | None = None
     """What was learned from the demonstrations elsewhere, in the plain state; see `Imitation.to_arrays`."""
+    lesson: Lesson | None = None
+    """What was taught for it in the page; None if that was nothing."""
 
     @classmethod
     def of(cls, task: Task) -> Own:
         """Return what a task is made from, whose demonstrations somebody has brought."""
         learned = task.imitation.to_arrays() if isinstance(task.imitation, Imitation) else None
         numbers = learned and {name: array for name, array in learned.items() if array.dtype.kind != "U"}
-        return cls(task.demonstrations, task.preparation, task.seen, task.moves, task.state, numbers)
+        return cls(task.demonstrations, task.preparation, task.seen, task.moves, task.state, numbers, task.lesson)
 
     @property
     def task(self) -> Task:
         """The task, without a name."""
         imitation = None if self.learned is None else Imitation.from_arrays(self.learned)
         own = {"preparation": self.preparation, "seen": self.seen, "state": self.state, "imitation": imitation}
-        task = replace(own_task(self.demonstrations), name="", **own)
+        task = replace(own_task(self.demonstrations), name="", lesson=self.lesson, **own)
         for scale, shift in self.moves:
             task = task.placed(scale, shift)
         return task
@@ -81,7 +84,8 @@ class Own:
         for scale, shift in self.moves:
             check_between("scale of a move", scale, *SCALES)
             check_between("shift of a move", float(np.abs(shift).max()), 0.0, MAX_DISTANCE)
-        own = replace(self, demonstrations=tuple(map(_as_given, self.demonstrations, usable)))
+        lesson = None if self.lesson is None else self.lesson.checked(source)
+        own = replace(self, demonstrations=tuple(map(_as_given, self.demonstrations, usable)), lesson=lesson)
         if (imitation := own.task.imitation) is not None:
             check_between("dimension of what was learned", len(imitation.goal), *[usable[0].dimension] * 2)
             parts = imitation.transform.parts if isinstance(imitation, Imitation) else ()

@@ -3,7 +3,7 @@
 The text is JSON, one object:
 
 `version`
-    `FORMAT`.
+    `FORMAT`, or `UNTAUGHT`.
 `scenario`
     The `Scenario` by its fields, without its `passing`, which a session decides anew. What is shown
     is its field `view`.
@@ -11,12 +11,15 @@ The text is JSON, one object:
     Position and look-at of the camera, metres; null is the view that the task begins with.
 `own`
     The task where it does not ship with DT-Viz, whose name then is "own_data"; see `Own`. Otherwise null.
+`lesson`
+    Takes that are taught and not learned yet; see `Lesson`. It is left out if there are none, here and in `own`.
 `arrays`
     Arrays by their names: demonstrations and shapes from files; see `dt_viz.files.texts`. It is left out if there are
     none.
 
 Objects are written by their fields, with the name of their class; fields that are left out have their defaults. Shapes
-of the paper's figures are written by their names (`Figure`). Version 1 had no `own` and no `arrays`.
+of the paper's figures are written by their names (`Figure`). Version 1 had no `own` and no `arrays`, version 2 no
+`lesson`.
 """
 
 from __future__ import annotations
@@ -64,10 +67,11 @@ from dt_viz.scenario.scenario import (
     Scenario,
 )
 from dt_viz.scenario.tasks import OWN, STYLES
+from dt_viz.scenario.taught import Lesson
 
-FORMAT = 2
-"""Version of the text; raised where versions from before could not read it."""
-READ = (1, FORMAT)
+FORMAT, UNTAUGHT = 3, 2
+"""Version of the text, raised where versions from before could not read it, and of one without any lesson."""
+READ = (1, UNTAUGHT, FORMAT)
 """Versions that are read."""
 MAX_BYTES = 16 * 10**6
 """Largest number of bytes of a text."""
@@ -107,6 +111,8 @@ class Saved:
     """None where the camera shows what the task begins with."""
     own: Own | None = None
     """The scenario's task where its demonstrations are not those of a known one."""
+    lesson: Lesson | None = None
+    """Takes that are taught and not learned yet; None if there are none."""
 
 
 @dataclass(frozen=True)
@@ -159,8 +165,13 @@ def encode(saved: Saved) -> str:
     scenario, arrays = replace(_with_obstacles(saved.scenario, _named), passing=None), dict[str, np.ndarray]()
     if saved.own is not None:
         scenario = replace(scenario, task=OWN)
-    plain = {"version": FORMAT, **packed(replace(saved, scenario=scenario), "saved", arrays)}
+    plain = {"version": UNTAUGHT, **packed(replace(saved, scenario=scenario), "saved", arrays)}
     del plain["scenario"]["passing"]
+    for taught in (plain, plain["own"]):
+        if taught is not None and taught["lesson"] is None:
+            del taught["lesson"]
+        elif taught is not None:
+            plain["version"] = FORMAT
     content = encoded(plain, arrays)
     with naming(ScenarioError, "scenario"):
         check_size(len(content), MAX_BYTES)
@@ -182,7 +193,7 @@ def decode(text: str | bytes, known: Known, source: str = "scenario") -> Saved:
         plain, arrays = decoded(content, fields, max_bytes=MAX_BYTES, max_plain=MAX_PLAIN)
         version = plain.pop("version", None)
         if version not in READ or isinstance(version, bool):
-            accepted = f"{' or '.join(map(str, READ))}; another version of DT-Viz may have saved it"
+            accepted = f"{', '.join(map(str, READ))}; another version of DT-Viz may have saved it"
             raise FormatError("version", repr(version)[:40], accepted)
         saved: Saved = unpacked(plain, Saved, "saved", arrays, {Transform: KINDS, Obstacle: (*SHAPES, Figure)})
         if arrays:
@@ -191,6 +202,8 @@ def decode(text: str | bytes, known: Known, source: str = "scenario") -> Saved:
         if saved.own is not None:
             saved, known = replace(saved, own=saved.own.checked(source)), replace(known, tasks=(*known.tasks, OWN))
             _check_named("task", saved.scenario.task, (OWN,))
+        if saved.lesson is not None:
+            saved = replace(saved, lesson=saved.lesson.checked(source))
         _check(saved, known)
         return saved
 

@@ -21,6 +21,7 @@ from dt_viz.obstacles.shapes import Point, as_point
 from dt_viz.scenario.objects import Ball, LiftedBox, Pot, PushedBox, TaskObject
 from dt_viz.scenario.scenario import Layer
 from dt_viz.scenario.slices import Slice
+from dt_viz.scenario.taught import Lesson
 from dt_viz.shipped import ASSETS
 
 if TYPE_CHECKING:
@@ -85,6 +86,8 @@ class Task:
     """What was learned from the demonstrations, in its state; None is learned here."""
     layers: tuple[Layer, ...] = ()
     """Transforms that it begins with, in the frame of the demonstrations; without any it is a sphere to avoid."""
+    lesson: Lesson | None = None
+    """What a visitor has taught for it in the page; None if that was nothing."""
 
     def to_world(self, points: Array) -> Array:
         """Transform points (*B, k) of the demonstrations to the world, (*B, 3), metres."""

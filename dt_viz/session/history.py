@@ -4,12 +4,26 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
 
 from dt_viz.scenario.scenario import Scenario
 
 GESTURE_PAUSE = 1.0
 """Time without an edit, seconds, after which the next edit of the same control is a step of its own for undo."""
 MAX_UNDO = 200
+
+
+@dataclass(frozen=True)
+class Beside:
+    """What is open beside the scenario, and has steps of its own that are undone meanwhile."""
+
+    steps: tuple[bool, bool]
+    """Whether there is something to undo, and to redo."""
+    undo: Callable[[], None]
+    """Takes the last step back; it must only submit."""
+    redo: Callable[[], None]
+    """Does again what was undone last; it must only submit."""
 
 
 class History:
@@ -23,6 +37,8 @@ class History:
         """Whether something is held, so that the gesture goes on however slow it is."""
         self._aside: tuple[Scenario, deque[Scenario], list[Scenario]] | None = None
         """What was set aside: the scenario, and those before and after it."""
+        self.beside: Beside | None = None
+        """What is open beside the scenario; None if nothing is."""
 
     @property
     def aside(self) -> Scenario | None:

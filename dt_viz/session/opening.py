@@ -25,8 +25,10 @@ from dt_viz.robot.robot import Robot
 from dt_viz.saving import sent_motion_task
 from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.tasks import OWN, Task, TaskEntry, own_task
+from dt_viz.scenario.taught import Lesson, Taught
+from dt_viz.session.history import MAX_UNDO
 from dt_viz.session.tasks_in_reach import in_reach
-from dt_viz.session.teaching import Taught, crosses_itself, drawn_beyond
+from dt_viz.session.teaching import SETTINGS, crosses_itself, drawn_beyond
 from dt_viz.warning import in_metres
 
 LENGTHS = tuple(unit for unit, (kind, _) in UNITS.items() if kind == "length")
@@ -68,20 +70,61 @@ class Opened:
     choices: Choices = field(default_factory=Choices)
     taught: tuple[Taught, ...] = ()
     """Takes that were taught in the page; they come after those of files."""
+    past: tuple[Lesson, ...] = ()
+    """What was taught before each step to undo, the last one last."""
+    future: tuple[Lesson, ...] = ()
+    """What was taught after each step to redo, the next one last."""
+
+    @classmethod
+    def again(cls, lesson: Lesson, preparation: PreparationSettings | None = None) -> Opened:
+        """Return what was taught, as it was before it was learned from with settings of the preparation."""
+        settings = PreparationSettings() if preparation is None else replace(preparation, goal=None)
+        choices = Choices(left_out=frozenset(lesson.left_out), preparation=settings)
+        return cls(choices=choices, taught=lesson.takes)
+
+    @property
+    def lesson(self) -> Lesson:
+        """What is taught."""
+        return Lesson(self.taught, tuple(sorted(self.choices.left_out)))
 
     @property
     def kept(self) -> tuple[Demonstration, ...]:
         """What is kept of the takes that were taught."""
-        takes = (each.take for each in self.taught)
-        return tuple(Demonstration(take.times, take.values, take.name) for take in takes)
+        return tuple(each.kept for each in self.taught)
+
+    @property
+    def steps(self) -> tuple[bool, bool]:
+        """Whether there is a take to undo, and to redo."""
+        return bool(self.past), bool(self.future)
+
+    def with_take(self, take: Taught) -> Opened:
+        """Return this with one more take, as a step for undo."""
+        return self._step(replace(self.lesson, takes=(*self.taught, take)))
 
     def without(self, number: int, name: str) -> Opened:
-        """Return the rest without the take of a number among all, and of a name, if that was taught."""
-        kept = tuple(each for each in self.taught if each.take.name != name)
-        if len(kept) == len(self.taught):
+        """Return this without the take of a number among all, and of a name, if that was taught: a step for undo."""
+        left = self.lesson.without(number, name)
+        return self if left.takes is self.taught else self._step(left)
+
+    def undone(self) -> Opened:
+        """Return this without the last step, if there is one."""
+        if not self.past:
             return self
-        left_out = frozenset(k - (k > number) for k in self.choices.left_out if k != number)
-        return replace(self, taught=kept, choices=replace(self.choices, left_out=left_out))
+        *past, there = self.past
+        return replace(self._with(there), past=tuple(past), future=(*self.future, self.lesson))
+
+    def redone(self) -> Opened:
+        """Return this with the step that was undone last, if there is one."""
+        if not self.future:
+            return self
+        *future, there = self.future
+        return replace(self._with(there), past=(*self.past, self.lesson), future=tuple(future))
+
+    def _step(self, there: Lesson) -> Opened:
+        return replace(self._with(there), past=(*self.past, self.lesson)[-MAX_UNDO:], future=())
+
+    def _with(self, lesson: Lesson) -> Opened:
+        return replace(self, taught=lesson.takes, choices=replace(self.choices, left_out=frozenset(lesson.left_out)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,9 +221,13 @@ def preview(recordings: Recordings, choices: Choices, robot: Robot, taught: Sequ
     seen = _inspected(used, choices, robot, board)
     drawn = tuple(each.drawn for each in taught)
     beyond = tuple(drawn_beyond(robot, drawn))
+    long = [f"{each.name} ({each.kept.duration:.0f} s)" for each in taught if each.kept.duration > SETTINGS.longest]
+    kept = f"{SETTINGS.most_points} points are used, evenly chosen: what is quicker than these is lost"
+    said += (f"of takes longer than {SETTINGS.longest:.0f} s, {', '.join(long)}, {kept}",) * bool(long)
     if taught and seen.task is not None:  # the plain state takes seconds, and cannot cross
-        seen = replace(seen, task=replace(seen.task, state="augmented"))
-        crossing = [each.take.name for each in taught if each.board is not None and crosses_itself(each.take.values)]
+        left_out = () if recordings.takes[: -len(taught)] else tuple(sorted(choices.left_out))
+        seen = replace(seen, task=replace(seen.task, state="augmented", lesson=Lesson(tuple(taught), left_out)))
+        crossing = [each.name for each in taught if crosses_itself(each.kept.positions)]
         which = "the augmented state, which remembers the phase, can"
         said += (f"what crosses itself ({', '.join(crossing)}) no plain motion follows: {which}",) * bool(crossing)
     return replace(seen, unit=unit, rate=rate, notes=said, drawn=drawn, beyond=beyond)

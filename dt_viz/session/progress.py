@@ -68,6 +68,8 @@ class Progress:
     """The scenario that was found in the browser; None if none was."""
     steps: tuple[bool, bool] = (False, False)
     """Whether there is something to undo, and to redo."""
+    beside: tuple[bool, bool] | None = None
+    """The same of what is open beside the scenario; None if nothing is."""
 
     @property
     def stale(self) -> bool:

@@ -23,7 +23,7 @@ from dt_viz.scenario.tasks import Task
 from dt_viz.session.arms import Engines, NewEngine
 from dt_viz.session.engine import Engine, wake
 from dt_viz.session.frame import Frame, Stage
-from dt_viz.session.history import History
+from dt_viz.session.history import Beside, History
 from dt_viz.session.jobs import Jobs
 from dt_viz.session.progress import Display, Edits, Screen
 from dt_viz.warning import Severity
@@ -281,12 +281,25 @@ class Session:
         return _with_a_level_of_its_own(replace(other, view=view))
 
     def undo(self) -> None:
-        """Take the last gesture back."""
-        self._travel(self._history.undone, seen=True)
+        """Take the last gesture back, or the last step of what is open beside the scenario."""
+        beside = self._history.beside
+        if beside is None:
+            self._travel(self._history.undone, seen=True)
+        else:
+            beside.undo()
 
     def redo(self) -> None:
-        """Do again what was undone last."""
-        self._travel(self._history.redone, seen=True)
+        """Do again what was undone last, of the scenario or of what is open beside it."""
+        beside = self._history.beside
+        if beside is None:
+            self._travel(self._history.redone, seen=True)
+        else:
+            beside.redo()
+
+    def put_beside(self, beside: Beside | None) -> None:
+        """Have `undo` and `redo` act on what is open beside the scenario, as it is now; None: on the scenario again."""
+        self._history.beside = beside
+        self._screen.tell(beside=None if beside is None else beside.steps)
 
     def cancel(self) -> None:
         """Stop learning a task, or loading an arm, and go back to what was shown; nothing is done without either."""

@@ -10,14 +10,14 @@ from scipy.interpolate import CubicSpline
 from scipy.linalg import eigh, solveh_banded
 
 from dt_viz.errors import FormatError, naming
-from dt_viz.files.takes import Take
 from dt_viz.flows.fields import Array, Mask
-from dt_viz.learning.demonstrations import DemonstrationError
+from dt_viz.learning.demonstrations import Demonstration, DemonstrationError
 from dt_viz.metrics import arc_length, resample_by_arc_length
 from dt_viz.robot.placement import REFERENCE_SHOULDER
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.tasks import DRAWING_AXES, DRAWING_CENTRE
+from dt_viz.scenario.taught import Taught
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class TeachingSettings:
     standing: float = 0.15
     """Time without a point from which on the pointer stood still, seconds."""
     most_points: int = 300
-    """Largest number of points that a spline is fitted to; of more, evenly chosen ones are used."""
+    """Largest number of points that a spline is fitted to; of more, evenly chosen ones are used, which is said."""
     most_recorded: int = 4096
     """Number of points at which every second one of a take that is still being made is dropped."""
     least_points: int = 5
@@ -44,6 +44,11 @@ class TeachingSettings:
     """Weight of the degrees of freedom in generalised cross-validation; above 1 fewer splines follow noise."""
     board: tuple[float, float] = (0.32, 0.28)
     """Half the width and height of the board, metres, for an arm as large as the JACO."""
+
+    @property
+    def longest(self) -> float:
+        """Duration up to which all points of a take are used, seconds."""
+        return self.most_points * self.interval
 
 
 SETTINGS = TeachingSettings()
@@ -75,18 +80,6 @@ class Stroke:
         return np.array(self.places).reshape(-1, 3)
 
 
-@dataclass(frozen=True, eq=False)
-class Taught:
-    """A take that was taught."""
-
-    take: Take
-    """What is kept of it: of a board in its coordinates, of the hand in space."""
-    drawn: Array
-    """(N, 3) places of the pointer, metres."""
-    board: Slice | None = None
-    """Board that it was drawn on; None was guided in space."""
-
-
 def board_of(robot: Robot) -> Slice:
     """Return the board of an arm: the drawing plane of the tasks, scaled about its shoulder by its size."""
     centre = robot.shoulder + robot.size * (DRAWING_CENTRE - REFERENCE_SHOULDER)
@@ -103,13 +96,12 @@ def taught(name: str, stroke: Stroke, board: Slice | None = None) -> Taught:
     """Keep a stroke, drawn on a board or guided in space, as a take of a name.
 
     Raises:
-        DemonstrationError: there are too few points, they hardly move, or they are not finite.
+        DemonstrationError: there are too few points, they hardly move, are not finite, or go too far or too long.
     """
     points = stroke.points
     with naming(DemonstrationError, name):
         times, kept = smoothed(np.array(stroke.moments), points if board is None else board.across(points))
-    units = {"length": 1.0, "time": 1.0, "angle": 1.0}
-    return Taught(Take(name, times, kept, None, None, (), units), points, board)
+        return Taught(Demonstration(times, kept, name), points, board).checked(name)
 
 
 def smoothed(times: Array, points: Array, settings: TeachingSettings = SETTINGS) -> tuple[Array, Array]:
@@ -178,19 +170,21 @@ def _without_noise(times: Array, points: Array, settings: TeachingSettings) -> A
 
 
 def crosses_itself(path: Array, num: int = 41) -> bool:
-    """Return whether a plane path (N, 2), of which so many points are looked at, crosses itself.
+    """Return whether a path (N, d), of which so many points are looked at, crosses itself in the plane or in space.
 
-    Two of its pieces lie on both sides of each other then; smaller loops, as of a pen that stands, are not seen.
+    Two of its pieces cross where both are seen along their common normal; in space they are nearer to each other than
+    a piece is long. Smaller loops, as of a pen that stands, are not seen.
     """
-    coarse = resample_by_arc_length(path, num)
-    a, b = coarse[:-1], coarse[1:]
-
-    def sides(points: Array) -> Array:
-        along, to = (b - a)[:, None], points[None] - a[:, None]
-        return along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0]
-
-    apart = sides(a) * sides(b) < 0
-    return bool((apart & apart.T).any())
+    coarse = resample_by_arc_length(np.pad(path, [(0, 0), (0, 3 - path.shape[1])]), num)
+    i, j = np.triu_indices(num - 1, k=2)  # neighbours touch
+    pieces, between = np.diff(coarse, axis=0), coarse[j] - coarse[i]
+    normal, lengths = np.cross(pieces[i], pieces[j]), np.linalg.norm(pieces, axis=1)
+    square = (normal**2).sum(axis=1)
+    skew = square > 1e-12 * (lengths[i] * lengths[j]) ** 2  # parallel pieces have no common normal
+    i, j, between, normal, square = (part[skew] for part in (i, j, between, normal, square))
+    along_i, along_j = ((np.cross(between, pieces[k]) * normal).sum(axis=1) / square for k in (j, i))
+    near = np.abs((between * normal).sum(axis=1)) < lengths.max() * np.sqrt(square)
+    return bool((near & (along_i > 0) & (along_i < 1) & (along_j > 0) & (along_j < 1)).any())
 
 
 def drawn_beyond(robot: Robot, paths: Sequence[Array]) -> list[Array]:

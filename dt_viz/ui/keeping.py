@@ -35,6 +35,7 @@ SLOW = "This browser has not told yet what it keeps: the page goes on with it wh
 BLOCKED = "This browser keeps nothing: after a reload, the page begins anew."
 FULL = "This browser has no room left to keep what you do: after a reload, the page begins as before."
 OWN_TASK = "Demonstrations as large as yours are not kept in this browser: save the scenario, and open that file again."
+OWN_TAKES = "Takes as long as yours are not kept in this browser: save the scenario, and open that file again."
 OWN_SHAPES = "Obstacles as large as yours are not kept in this browser: save the scenario, and open that file again."
 
 
@@ -93,7 +94,8 @@ class Keeper:
         if BLOCKED in trouble:
             return
         self._session, self._resume = session, resume
-        late = None if self.begun is None or self.begun.scenario == session.scenario else self.begun
+        begun = self.begun
+        late = None if begun is None or (begun.scenario == session.scenario and begun.lesson is None) else begun
         if late is not None or self._attempts:
             self._first = session.scenario
         if late is not None:
@@ -145,8 +147,10 @@ class Keeper:
         return True
 
     def _waits(self, session: Session) -> bool:
-        """Whether the page has still to go on with what the browser keeps: an edit takes its place."""
-        if session.scenario != self._first:
+        """Whether the page has still to go on with what the browser keeps: an edit, or a take, takes its place."""
+        if self._first is None:
+            return False
+        if session.scenario != self._first or self._present(self._known.tasks).lesson is not None:
             self._first = None
         return self._first is not None
 
@@ -182,12 +186,16 @@ class Keeper:
         """What is to be written; None where it cannot be, which the visitor is told."""
         present = self._present(self._known.tasks)
         small, num_left = portable(present.scenario)
+        said: list[str] = []
         if (text := _short(present)) is None and num_left:
-            text = _short(replace(present, scenario=small))
-            if text is not None:
-                self._say(OWN_SHAPES)
-        if text is None:
-            self._say(OWN_TASK)
+            said.append(OWN_SHAPES)
+            text = _short(present := replace(present, scenario=small))
+        own = present.own
+        if text is None and (present.lesson or (own and own.lesson)):
+            said.append(OWN_TAKES)
+            text = _short(replace(present, lesson=None, own=own and replace(own, lesson=None)))
+        for each in [OWN_TASK] if text is None else said:
+            self._say(each)
         return text
 
     def _remove(self) -> None:

@@ -19,7 +19,7 @@ from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import avoidance_layer, avoiding_with
 from dt_viz.scenario.tasks import Task
 from dt_viz.session.frame import Frame
-from dt_viz.session.progress import Message, Progress
+from dt_viz.session.progress import Progress
 from dt_viz.session.session import CHOICES, Session
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.controls import Control
@@ -97,18 +97,17 @@ class ControlPanel:
         `Tour`.
         """
         self._notify, self._titles = notify, dict(titles)
-        self._notified: Message | None = None
         self._scenes = {scene.title: scene for scene in offered(self._titles)}
         self.bindings = bindings = Bindings()
         self.presentation = Presentation(gui, self._turn, lambda alone: tripod.reframe(alone=alone))
         bindings.show(self._title, lambda title: self.presentation.write(title=title))
         enlarge = big_type(gui, tripod)
         self.tour = Tour(gui, bindings, tripod, self.choose, storage, came_back)
-        opening, self._scene = self._add_choices(
+        self.opening, self._scene = self._add_choices(
             gui, preview, lambda name, content: open_scenario(name, content) or loader.takes(name, content), send
         )
         if pen is not None:
-            TeachPanel(gui, bindings, opening, pen)
+            TeachPanel(gui, bindings, self.opening, pen)
         self.hint = gui.add_html(hint_html(""))
         add_avoid_and_imitate(gui, bindings)
         self.status = StatusLine(gui, bindings)
@@ -134,7 +133,7 @@ class ControlPanel:
         with tabs.add_tab("Picture"):
             act = {"darken": darken, "enlarge": enlarge, "render": render, "draw": self._draw, "record": record}
             picture = PictureTab(gui, bindings, tripod, self.presentation, film=film, send=send, **act)
-        commands = self._commands(gui.main_panel, picture, reset, save, opening)
+        commands = self._commands(gui.main_panel, picture, reset, save)
         add_commands(gui, bindings, commands)
         add_about(gui, bindings, commands, self.tour.take)
         self.take(robot)
@@ -178,15 +177,15 @@ class ControlPanel:
 
     def tell(self, progress: Progress) -> None:
         """Show the verdict on what is shown, its hint, and a message, which is for a while beside the panel, too."""
+        notified = self.status.message
         self.status.tell(progress)
         text = "" if progress.shown is None or progress.stale else hint(progress.shown)
         step = self.tour.step
         self.hint.content = hint_html(text if step is None else "")
         self.presentation.write(caption=text if step is None else step.text)
         message = progress.message
-        if message is not None and message is not self._notified:
+        if message is not None and message is not notified:
             self._notify(sentence(message.text), COLOURS[message.severity][0])
-        self._notified = message
 
     def _add_choices(
         self,
@@ -239,6 +238,8 @@ class ControlPanel:
                 scenario = replace(scenario, task=self._bring(session, saved.own.task, scenario.arm))
             began(replace(saved, scenario=scenario))
             session.restore(scenario)
+            if saved.lesson is not None:
+                self.opening.reopen(saved.lesson)
 
         self.begin(begin, session, "")
 
@@ -321,7 +322,6 @@ class ControlPanel:
         picture: PictureTab,
         reset: Callable[[Session], None],
         save: Callable[[Session], None],
-        opening: OpenPanel,
     ) -> list[Command]:
         folded = False  # a visitor may unfold it by hand, which nobody is told of
 
@@ -332,10 +332,10 @@ class ControlPanel:
                 (panel.minimize if folded else panel.expand)()
 
         def leave(session: Session) -> None:
-            if not (self.presentation.on or opening.folder.visible):
+            if not (self.presentation.on or self.opening.folder.visible):
                 self.tour.end(session)
             self.presentation.show(False)
-            opening.later(opening.close)
+            self.opening.later(self.opening.close)
 
         return [
             *self.show.timeline.commands,

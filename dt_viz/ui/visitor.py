@@ -242,7 +242,8 @@ class Visitor(Display):
         pose = self._panel.tour.pose if self.session.visits else self._camera.chosen
         scenario = self.session.own
         own = None if scenario.task in tasks else Own.of(self.session.engines(scenario.arm).task(scenario.task))
-        return Saved(scenario, _sight(pose), own)
+        lesson = self._panel.opening.lesson
+        return Saved(scenario, _sight(pose), own, None if own is not None and own.lesson == lesson else lesson)
 
     def _came_back(self, pose: Pose | None) -> None:
         """Have the camera where it was before the tour, with the visitor's own scenario."""
@@ -288,6 +289,7 @@ class Visitor(Display):
             if seen.task is not None and not before:
                 self._camera.look(seen.task)
             self.client.flush()
+        self._keeper.changed()
 
     def _end_preview(self) -> None:
         """Show the motion again in place of takes."""

@@ -42,9 +42,10 @@ from dt_viz.scenario.saved import (
     portable,
 )
 from dt_viz.scenario.scenario import SLICE_COLOURS, Scenario, Start, View
-from dt_viz.scenario.slices import SlicePose
+from dt_viz.scenario.slices import Slice, SlicePose
 from dt_viz.scenario.stack import with_avoidance
 from dt_viz.scenario.tasks import OWN, TASKS
+from dt_viz.scenario.taught import MAX_POINTS, MAX_TAKES, Lesson, Taught
 
 METHODS = ("eflow-repulsive", "linear", "modulation")
 KNOWN = Known(tuple(TASKS), ("", "panda"), METHODS)
@@ -231,6 +232,111 @@ def test_a_text_of_the_first_version_is_read_and_saved_as_one_of_this():
     assert_read_back(saved)
 
 
+def lesson(num: int = 2) -> Lesson:
+    """Takes that were drawn, and one that was guided, with values that are no short decimals."""
+    rng, s = np.random.default_rng(6), np.linspace(0, 1, 30)[:, None]
+    board = Slice(np.array([0.1, -0.5, 1 / 3]), np.eye(3)[:, :2], (0.3, 0.2))
+
+    def take(name: str, dim: int) -> Taught:
+        path = s * rng.normal(size=dim) * 0.2
+        kept = check_demonstrations([Demonstration(3 * s[:, 0] + s[:, 0] / 3, path, name)], "test")[0]
+        return Taught(kept, rng.uniform(-0.3, 0.3, (20, 3)), board if dim == 2 else None)
+
+    return Lesson((*(take(f"drawn {k + 1}", 2) for k in range(num)), take(f"guided {num + 1}", 3)), (1,))
+
+
+@pytest.mark.parametrize("num", [1, MAX_TAKES - 1])
+def test_takes_that_are_taught_are_read_back_to_the_last_bit_learned_or_not(num):
+    own = replace(brought(), lesson=lesson(num))
+    for saved in (Saved(rich().scenario, lesson=lesson(num)), Saved(Scenario("own_data_1"), own=own, lesson=lesson())):
+        text = encode(saved)
+        again = decode(text, KNOWN)
+        assert encode(again) == text and '"version":3' in text
+        assert again.lesson is not None and saved.lesson is not None
+        for a, b in zip(saved.lesson.takes, again.lesson.takes, strict=True):
+            assert (a.name, a.drawn.tobytes(), a.kept.times.tobytes()) == (
+                b.name,
+                b.drawn.tobytes(),
+                b.kept.times.tobytes(),
+            )
+            assert a.kept.positions.tobytes() == b.kept.positions.tobytes()
+            assert (a.board and a.board.key) == (b.board and b.board.key)
+        assert again.lesson.left_out == (1,)
+    assert again.own is not None and again.own.task.lesson == again.own.lesson is not None
+    assert Own.of(again.own.task).lesson is again.own.lesson
+
+
+def test_without_takes_that_are_taught_the_text_is_as_of_the_version_before():
+    frozen = (Path(__file__).parent.parent / "frozen" / "scenario_version_2.json").read_text(encoding="utf-8")
+    for saved in (rich(), Saved(Scenario("own_data_1"), own=brought())):
+        assert '"version":2' in encode(saved) and "lesson" not in encode(saved)
+    again = decode(frozen, KNOWN)
+    assert encode(again) == frozen and again.lesson is None and again.own is not None and again.own.lesson is None
+
+
+def taught(**changes: Any) -> Any:
+    """Change the first of some takes, which was drawn: fields of it, of what is kept, and of its board."""
+
+    def change(given: Lesson) -> Lesson:
+        first, *others = given.takes
+        fields = {part: set(getattr(first, part).__dataclass_fields__) for part in ("kept", "board")}
+        parts = {
+            part: replace(getattr(first, part), **{name: changes[name] for name in changes if name in fields[part]})
+            for part in fields
+        }
+        own = {name: value for name, value in changes.items() if name in ("drawn", "board")}
+        return replace(given, takes=(replace(first, **parts | own), *others))
+
+    return change
+
+
+PATH = np.linspace(0, 0.2, 30)[:, None]
+LESSON_FORGERIES: list[tuple[Any, str]] = [
+    (taught(name="guided 3"), "names of takes"),
+    (taught(name="drawn ٣"), "name of a take"),
+    (taught(name="drawn 0"), "name of a take"),
+    (taught(name="drawn " + "9" * 400), "name of a take"),
+    (taught(name="<script> 1"), "name of a take"),
+    (taught(positions=PATH * [1, np.nan]), "positions"),
+    (taught(positions=PATH * [1, 1000]), "positions"),
+    (taught(positions=PATH * [0, 0]), "positions"),
+    (taught(positions=PATH * [1, 1, 1]), "drawn 1"),
+    (taught(orientations=np.full((30, 4), 0.5)), "drawn 1"),
+    (taught(times=np.zeros(30)), "times"),
+    (taught(board=None), "drawn 1"),
+    (taught(drawn=np.zeros((0, 3))), "drawn"),
+    (taught(drawn=np.zeros((20, 2))), "drawn"),
+    (taught(drawn=np.zeros((MAX_POINTS + 1, 3))), "drawn"),
+    (taught(drawn=np.full((20, 3), 1e9)), "drawn"),
+    (taught(centre=np.zeros(2)), "board"),
+    (taught(axes=np.eye(3)), "board"),
+    (taught(centre=np.full(3, 9.0)), "centre"),
+    (taught(axes=np.ones((3, 2))), "axes"),
+    (taught(half_size=(0.0, 0.2)), "half_size"),
+    (taught(half_size=(0.2, 1e3)), "half_size"),
+    (lambda given: replace(given, takes=()), "number of takes"),
+    (lambda given: replace(given, left_out=(3,)), "left_out"),
+    (lambda given: replace(given, left_out=(1, 0)), "left_out"),
+    (lambda given: replace(given, left_out=(1, 1)), "left_out"),
+    (lambda given: replace(given, left_out=(-1,)), "left_out"),
+]
+
+
+@pytest.mark.parametrize("learned", [True, False])
+@pytest.mark.parametrize(("forge", "field"), LESSON_FORGERIES)
+def test_forged_takes_are_refused_by_the_name_of_what_is_wrong(forge, field, learned):
+    forged = forge(lesson())
+    saved = Saved(Scenario("own_data_1"), own=replace(brought(), lesson=forged)) if learned else None
+    with pytest.raises(DataError) as caught:
+        decode(encode(saved or Saved(rich().scenario, lesson=forged)), KNOWN, "a file")
+    assert field in caught.value.field and str(caught.value).startswith("a file: "), caught.value
+
+
+def test_more_takes_than_a_page_teaches_are_refused():
+    with pytest.raises(DataError, match="takes"):
+        decode(encode(Saved(Scenario("draw_s"), lesson=lesson(MAX_TAKES))), KNOWN)
+
+
 def test_an_open_mesh_is_refused_and_a_closed_one_is_not():
     for faces, refused in ((FROM_FILE.faces, False), (FROM_FILE.faces[:5], True)):
         mesh = MeshObstacle(PLACE, Solid(FROM_FILE.vertices, faces))
@@ -290,7 +396,7 @@ AVOIDANCE, BIAS, SPHERE = (
     "scenario.stack.2.transform.obstacles.0",
 )
 FORGERIES: list[tuple[str, Any, str]] = [
-    ("version", 3, "version"),
+    ("version", 4, "version"),
     ("version", 0, "version"),
     ("version", True, "version"),
     ("version", None, "version"),

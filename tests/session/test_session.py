@@ -26,7 +26,7 @@ from dt_viz.scenario.tasks import TASKS
 from dt_viz.session import session as session_module
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Stage
-from dt_viz.session.history import GESTURE_PAUSE, MAX_UNDO
+from dt_viz.session.history import GESTURE_PAUSE, MAX_UNDO, Beside
 from dt_viz.session.progress import READ
 from dt_viz.session.session import Session
 from dt_viz.warning import Severity
@@ -326,6 +326,20 @@ def test_history_does_not_grow_without_end(opened):
     for _ in range(MAX_UNDO + 50):
         opened.session.undo()
     assert opened.session.scenario.avoidance.temperature == 20.0 + 49
+
+
+def test_what_is_open_beside_the_scenario_is_undone_in_its_place(opened):
+    session, told = opened.session, []
+    opened.edit("drag", obstacles=at(0.1))
+    before = session.scenario
+    session.put_beside(Beside((False, True), lambda: told.append("undo"), lambda: told.append("redo")))
+    session.undo()
+    session.redo()
+    assert told == ["undo", "redo"] and session.scenario == before
+    assert (opened.page.progress.beside, opened.page.progress.steps) == ((False, True), (True, False))
+    session.put_beside(None)
+    session.undo()
+    assert session.scenario != before and opened.page.progress.beside is None
 
 
 def test_reset_goes_back_to_the_beginning_and_how_it_was_seen_and_the_motion_can_be_undone(opened):

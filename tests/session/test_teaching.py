@@ -1,5 +1,7 @@
 """Takes that are taught: a spline keeps the times and takes out noise; what is no take is one line; the task stays."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from dt_viz.motion.learned import learned_of
 from dt_viz.robot.models import load_arm
 from dt_viz.scenario.own import Own
 from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.taught import Lesson
 from dt_viz.session import opening
 from dt_viz.session.opening import Choices, Opened
 from dt_viz.session.teaching import (
@@ -163,6 +166,34 @@ def test_what_crosses_itself_is_said_and_learned(robot, fits):
     assert learned.imitation.state == "augmented"
 
 
+def in_space(kind, depth=0.0):
+    """A path in space that is a curve as seen along a direction, and as deep along it, (N, 3), metres."""
+    u = np.linspace(0, 1, 100)
+    flat = np.concatenate([curve(u, kind), depth * u[:, None]], axis=1)
+    return flat @ np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0] + [0.0, -0.4, 0.4]
+
+
+def test_what_is_guided_across_itself_is_said_too_and_passing_far_behind_is_no_crossing(robot):
+    assert [crosses_itself(in_space(kind)) for kind in ("S", "8")] == [False, True]
+    assert [crosses_itself(in_space("8", depth)) for depth in (0.02, 0.5)] == [True, False]
+    there_and_back = np.abs(np.linspace(-1, 1, 100))[:, None] * [0.1, 0.2, 0.3]
+    assert not crosses_itself(there_and_back)
+    for kind, crosses in (("S", False), ("8", True)):
+        hand = Stroke([*np.linspace(0, T, 100)], [*in_space(kind)])
+        seen = opening.preview(Recordings(), Choices(), robot, [taught("guided 1", hand)])
+        assert any("crosses itself (guided 1)" in note for note in seen.notes) == crosses
+
+
+def test_a_take_of_which_points_are_left_out_for_its_length_is_named(robot):
+    board = board_of(robot)
+    for duration, thinned in ((SETTINGS.longest - 0.5, False), (SETTINGS.longest + 5.0, True)):
+        times = np.arange(0, duration, SETTINGS.interval)
+        long = taught("drawn 1", Stroke([*times], [*board.at(curve(times / times[-1]))]), board)
+        seen = opening.preview(Recordings(), Choices(), robot, [long])
+        assert any("drawn 1 (20 s), 300 points" in note for note in seen.notes) == thinned
+        assert (len(times) > SETTINGS.most_points) == thinned
+
+
 def test_places_out_of_reach_are_red_and_the_take_is_scaled_if_that_is_wanted(robot):
     board = board_of(robot)
     away = board.centre + np.array([0.0, -0.55, 0.0])  # of the arm
@@ -187,10 +218,45 @@ def test_a_board_is_in_the_reach_of_other_arms(robot):
 def test_a_take_is_deleted_and_the_others_keep_what_was_chosen_for_them(robot):
     opened = Opened(taught=three(robot), choices=Choices(left_out=frozenset([0, 2])))
     rest = opened.without(1, "drawn 2")
-    assert [each.take.name for each in rest.taught] == ["drawn 1", "drawn 3"]
+    assert [each.name for each in rest.taught] == ["drawn 1", "drawn 3"]
     assert rest.choices.left_out == {0, 1}
     assert opened.without(0, "drawn 1").choices.left_out == {1}
     assert opened.without(1, "a file's") is opened
+
+
+def test_takes_that_are_added_and_deleted_are_undone_and_redone_with_what_is_left_out(robot):
+    first, second, third = three(robot)
+    states = [Opened(files=(("a.csv", b""),), choices=Choices(goal=1))]
+    states.append(states[-1].with_take(first))
+    states.append(states[-1].with_take(second))
+    states[-1] = replace(states[-1], choices=replace(states[-1].choices, left_out=frozenset([1])))
+    states.append(states[-1].without(0, "drawn 1"))
+    states.append(states[-1].with_take(third))
+    opened = states[-1]
+    assert opened.steps == (True, False) and opened.without(0, "a file's") is opened is opened.redone()
+    for state in reversed(states[:-1]):
+        opened = opened.undone()
+        assert (opened.lesson, opened.files, opened.choices.goal) == (state.lesson, state.files, 1)
+    assert opened.steps == (False, True) and opened.undone() is opened
+    for state in states[1:]:
+        opened = opened.redone()
+        assert opened.lesson == state.lesson
+    assert opened.undone().with_take(third).steps == (True, False)
+    assert Opened.again(opened.lesson).lesson == opened.lesson
+
+
+def test_a_task_knows_what_was_taught_for_it(robot):
+    takes = three(robot)
+    choices = Choices(left_out=frozenset([1]))
+    task = opening.preview(Recordings(), choices, robot, takes).task
+    assert task is not None and task.lesson == Lesson(takes, (1,)) and len(task.demonstrations) == 2
+    placed = task.placed(0.7, (0.0, 0.1, 0.0))
+    assert placed.lesson == task.lesson
+    files = Recordings(takes=tuple(each.take for each in takes))
+    beside = opening.preview(files, choices, robot, takes[:1]).task
+    assert beside is not None and beside.lesson == Lesson(takes[:1])  # numbers of others mean nothing
+    alone = opening.preview(files, choices, robot).task
+    assert alone is not None and alone.lesson is None
 
 
 @pytest.mark.parametrize("kind", WRITERS)

@@ -22,10 +22,12 @@ from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import OWN, TASKS, own_task
 from dt_viz.session.frame import Stage
 from dt_viz.session.session import CHOICES
+from dt_viz.session.teaching import Stroke, board_of
 from dt_viz.ui import keeping, panel
 from dt_viz.ui.keeping import KEY, LANE, PAUSE
 from dt_viz.ui.scene.camera import view_of
 from dt_viz.ui.scripts import Link, told
+from dt_viz.ui.tabs.opening import CHOOSING, SEEING
 from dt_viz.ui.tabs.status import verdict
 from dt_viz.ui.visitor import initial_scenario
 
@@ -405,6 +407,133 @@ def test_a_task_of_large_demonstrations_leaves_what_was_kept_before(opened_for, 
     page.session.choose_task("draw_j")
     settled(page)
     assert kept(browser).scenario.task == "draw_j"
+
+
+def idle(page: Page) -> None:
+    for lane in (LANE, CHOICES, CHOOSING, SEEING, CHOICES, SEEING, LANE):  # one has the next one work
+        assert page.session.jobs.wait_idle(lane, PATIENCE)
+
+
+def teach(page: Page, num: int = 2) -> None:
+    """Draw some strokes on the board."""
+    opening, board, u = page.visitor._panel.opening, board_of(page.session.robot), np.linspace(0, 1, 40)
+    opening.teach()
+    for k in range(num):
+        path = np.stack([0.1 * np.sin((3 + 0.1 * k) * u), 0.3 * u], axis=1)
+        opening.add("drawn", Stroke([*(2 * u)], [*board.at(path)]), board)
+    idle(page)
+
+
+def open_takes(page: Page) -> tuple[str, ...]:
+    opening = page.visitor._panel.opening
+    return opening.controls["take"].handle.options if opening.folder.visible else ()
+
+
+def kept_takes(browser: Any) -> tuple[str, ...]:
+    """Names of the takes that are kept and not learned."""
+    lesson = kept(browser).lesson
+    return () if lesson is None else tuple(take.name for take in lesson.takes)
+
+
+@pytest.mark.parametrize("scenario", [None, MADE], ids=["as the page begins", "edited"])
+def test_takes_that_are_not_learned_are_kept_and_open_in_the_next_page(opened_for, scenario):
+    browser = Browser()
+    page = opened_for(browser)
+    if scenario is not None:
+        page.begin(scenario)
+    teach(page)
+    before = page.visitor._panel.opening.lesson
+    assert before is not None and encode(Saved(page.session.scenario, lesson=before)) == browser[KEY]
+    again = opened_for(Browser(**browser))
+    idle(again)
+    assert open_takes(again) == ("1 · drawn 1", "2 · drawn 2") and not again["Learn"].disabled
+    assert again.session.scenario == page.session.scenario and message(again) == ""
+    assert again.session._screen.progress.restored == again.session.scenario  # the status says so in a word
+    teach(again, 1)
+    assert len(kept_takes(again.client.local_storage)) == 3
+    again.session.undo()
+    idle(again)
+    assert kept_takes(again.client.local_storage) == ("drawn 1", "drawn 2")
+    again.claim(again["Cancel"], True)
+    idle(again)
+    assert kept_takes(again.client.local_storage) == () and '"version":2' in again.client.local_storage[KEY]
+
+
+def test_takes_that_are_learned_are_kept_with_their_task_and_put_back_in_the_next_page(opened_for):
+    browser = Browser()
+    page = opened_for(browser)
+    teach(page)
+    page.claim(page["Learn"], True)
+    idle(page)
+    told = [decode(text, KNOWN) for _, text in browser.told]
+    assert all(saved.lesson is not None or (saved.own is not None and saved.own.lesson) for saved in told[1:])
+    saved = kept(browser)
+    assert saved.lesson is None and saved.own is not None and saved.own.lesson is not None
+    again = opened_for(Browser(**browser))
+    idle(again)
+    assert open_takes(again) == () and again.session.scenario.task == "own_data_1"
+    teach(again, 1)
+    assert open_takes(again) == ("1 · drawn 1", "2 · drawn 2", "3 · drawn 3")
+
+
+def test_takes_wait_where_another_task_is_chosen_and_are_still_kept(opened_for):
+    browser = Browser()
+    page = opened_for(browser)
+    teach(page)
+    page.claim(page["Task"], "Draw J")
+    idle(page)
+    assert open_takes(page) == () and kept(browser).scenario.task == "draw_j"
+    assert len(kept_takes(browser)) == 2
+    teach(page, 1)
+    assert len(open_takes(page)) == 3
+
+
+def test_a_file_has_the_takes_too_and_those_that_were_open_come_back_by_undo(opened_for, monkeypatch):
+    page = opened_for(Browser())
+    teach(page, 3)
+    sent = []
+    monkeypatch.setattr(page.client, "send_file_download", lambda _name, content, **_how: sent.append(content))
+    page.claim(page["History"], "Save")
+    page.done()
+    page.claim(page["Cancel"], True)
+    idle(page)
+    teach(page, 1)
+    page.visitor._panel.opening.load("mine.json", sent[0])
+    idle(page)
+    assert len(open_takes(page)) == 3
+    page.session.undo()
+    idle(page)
+    assert len(open_takes(page)) == 1
+
+
+def test_takes_that_are_too_long_are_said_once_and_all_else_is_kept(opened_for, monkeypatch):
+    browser = Browser()
+    page = opened_for(browser)
+    monkeypatch.setattr(keeping, "MAX_KEPT", len(made()) + 500)
+    said = []
+    page.session.say = lambda text, severity: said.append(text)
+    teach(page)
+    page.begin(MADE)
+    settled(page)
+    assert said == [keeping.OWN_TAKES] and kept(browser) == Saved(MADE)
+
+
+def test_takes_of_a_slow_browser_are_opened_unless_something_is_taught_before(opened_for):
+    first = opened_for(Browser())
+    teach(first)
+    text = first.client.local_storage[KEY]
+    for num in (0, 1):
+        browser = Slow(**{KEY: text})
+        page = opened_for(browser)
+        if num:
+            opening, board = page.visitor._panel.opening, board_of(page.session.robot)
+            opening.teach()
+            opening.add("drawn", Stroke([*np.arange(9.0)], [*board.at(np.linspace([0, 0], [0.1, 0.1], 9))]), board)
+        browser.answers = True
+        wait_until(lambda page=page: not page.visitor._keeper._attempts)
+        idle(page)
+        assert len(open_takes(page)) == (num or 2)
+        assert len(kept_takes(browser)) == (num or 2)
 
 
 def test_a_link_begins_its_task_afresh_also_where_that_is_what_was_kept_and_undo_brings_it_back(opened_for):

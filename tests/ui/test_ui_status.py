@@ -307,6 +307,7 @@ def test_what_nothing_else_mends_is_mended_by_undo_where_there_is_a_step():
     for told in (frame(blocked=(ODD,)), frame(certificates=Certificates(0.01).warning(ODD))):
         assert remedy(told, Progress(HAND)) is None
         assert remedy(told, Progress(HAND, steps=(True, False))) is UNDO
+        assert remedy(told, Progress(HAND, steps=(True, False), beside=(True, False))) is None  # it undoes a take
     assert remedy(frame(), Progress(HAND, steps=(True, True))) is None
 
 

@@ -5,11 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import viser  # noqa: TID251 - a second server
-from pages import PATIENCE, Page, wait_until
+from pages import PATIENCE, Page, frame_of, wait_until
 
 from dt_viz.session.session import CHOICES
 from dt_viz.session.teaching import board_of
 from dt_viz.ui import pen
+from dt_viz.ui.tabs import opening
 from dt_viz.ui.tabs.opening import CHOOSING, SEEING
 
 BOARD = "/teaching/board"
@@ -106,6 +107,117 @@ def test_three_takes_are_drawn_deleted_and_learned_as_a_task_of_ones_own(teachin
     assert page.session.scenario.task == "draw_s"
 
 
+def draw_and_learn(teaching, num=2):
+    teaching.choose("Draw your own")
+    for k in range(num):
+        teaching.draw_s(1 + 0.03 * k)
+    teaching.choose("Learn")
+    return teaching.page.session.scenario.task
+
+
+def shows_learned(teaching):
+    session = teaching.page.session
+    teaching.page.visitor._panel.bindings.report(frame_of(session.scenario, task=session.task))
+
+
+def test_what_was_learned_from_is_put_back_while_its_task_is_shown_and_learned_again(teaching):
+    page, session = teaching.page, teaching.page.session
+    first = draw_and_learn(teaching, 3)
+    shows_learned(teaching)
+    assert not is_shown(page, "Download") and page["Learn"].disabled
+    teaching.choose("Draw your own")
+    assert teaching.num_kept == 3 and is_shown(page, "Download") and teaching.shown.board.visible
+    np.testing.assert_allclose(teaching.takes.drawn.node.points[0, 0], teaching.board.at(S)[0], atol=1e-6)
+    teaching.choose("Take", "2 · drawn 2")
+    teaching.choose("Use this take", False)
+    teaching.draw_s()
+    assert page["Take"].options[-1] == "4 · drawn 4"
+    teaching.choose("Learn")
+    second = session.scenario.task
+    assert second != first and len(session.task.demonstrations) == 3
+    shows_learned(teaching)
+    teaching.choose("Draw your own")
+    assert len(page["Take"].options) == 4 and teaching.num_kept == 3  # what was left out still is
+    teaching.choose("Cancel")
+    session.undo()
+    assert session.scenario.task == first
+    teaching.choose("Draw your own")
+    assert page["Take"].options == ("1 · drawn 1", "2 · drawn 2", "3 · drawn 3") and teaching.num_kept == 3
+    teaching.choose("Cancel")
+    session.redo()
+    teaching.choose("Draw your own")
+    assert len(page["Take"].options) == 4
+    teaching.choose("Task", "Draw J")
+    teaching.choose("Draw your own")
+    assert teaching.num_kept == 0 and page["Learn"].disabled
+
+
+def test_what_could_not_be_learned_is_put_back_beside_any_task_until_it_is(teaching):
+    page, session = teaching.page, teaching.page.session
+    draw_and_learn(teaching)
+    session.undo()  # as where learning is cancelled
+    assert session.scenario.task == "draw_s"
+    teaching.choose("Draw your own")
+    assert teaching.num_kept == 2
+    teaching.choose("Learn")
+    shows_learned(teaching)
+    session.undo()
+    teaching.choose("Draw your own")
+    assert teaching.num_kept == 0 and page["Learn"].disabled
+
+
+def test_undo_takes_back_takes_while_teaching_and_leaves_the_scenario_alone(teaching):
+    page, session = teaching.page, teaching.page.session
+    session.step("Warp", warp=0.5)
+    session.step("Task", task="draw_j")
+    before = session.scenario
+
+    def travels(button):
+        page.claim(page["History"], button)
+        teaching.done()
+
+    def steps():
+        told = page.visitor._panel.status.steps.content
+        return tuple(f"nth-of-type({k})" not in told for k in (1, 2))
+
+    assert steps() == (True, False)
+    teaching.choose("Draw your own")
+    assert steps() == (False, False)
+    travels("Undo")
+    assert session.scenario == before and teaching.shown.board.visible
+    for k in range(3):
+        teaching.draw_s(1 + 0.03 * k)
+    assert steps() == (True, False)
+    teaching.choose("Take", "2 · drawn 2")
+    teaching.choose("Delete this take")
+    travels("Undo")
+    assert teaching.num_kept == 3 and steps() == (True, True)
+    page.give(page.commands["Undo"])
+    teaching.done()
+    assert page["Take"].options == ("1 · drawn 1", "2 · drawn 2")
+    for _ in range(2):
+        travels("Redo")
+    assert page["Take"].options == ("1 · drawn 1", "2 · drawn 3") and steps() == (True, False)
+    for _ in range(5):
+        travels("Undo")
+    assert teaching.num_kept == 0 and page["Learn"].disabled and steps() == (False, True)
+    assert session.scenario == before and session._history.steps == (True, False)
+    teaching.draw_s()
+    assert teaching.takes.name.text == "drawn 1" and steps() == (True, False)
+    teaching.choose("Cancel")
+    assert steps() == (True, False)
+    travels("Undo")
+    assert session.scenario.task == "draw_s" and session.scenario.warp == 0.5
+
+
+def test_more_takes_than_a_task_may_have_are_refused(teaching, monkeypatch):
+    monkeypatch.setattr(opening, "MAX_TAKES", 2)
+    teaching.choose("Draw your own")
+    for _ in range(3):
+        teaching.draw_s()
+    assert teaching.num_kept == 2 and "delete one first" in teaching.told[-1]
+
+
 def test_cancel_escape_and_another_task_end_it(teaching):
     page = teaching.page
     for leave in (
@@ -121,7 +233,7 @@ def test_cancel_escape_and_another_task_end_it(teaching):
         assert not teaching.takes.visible and not teaching.shown.board.visible
         assert teaching.shown._always[-1].visible and not is_shown(page, "Delete this take")
         teaching.choose("Draw your own")
-        assert teaching.num_kept == 0 or not page["Learn"].visible or page["Learn"].disabled
+        assert teaching.num_kept == (page.session.scenario.task == "draw_j")  # where nobody gave them up they wait
         teaching.choose("Cancel")
 
 

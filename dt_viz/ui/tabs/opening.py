@@ -19,7 +19,9 @@ from dt_viz.obstacles.files import MESH_SUFFIXES
 from dt_viz.saving import is_motion
 from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.tasks import Task
+from dt_viz.scenario.taught import MAX_TAKES, Lesson
 from dt_viz.session import opening
+from dt_viz.session.history import Beside
 from dt_viz.session.opening import LENGTHS, USUAL_RATES, Choices, Opened, Preview
 from dt_viz.session.session import Session
 from dt_viz.session.teaching import Stroke, taught
@@ -95,8 +97,9 @@ class OpenPanel:
             cancel = gui.add_button("Cancel", color="gray")
         self.controls["learn"] = self.control(start, lambda _pressed: self._press())
         self.control(cancel, lambda _pressed: self.close())
-        bindings.show(lambda s: (s.task, s.scene), lambda _chosen: self.close())
+        bindings.show(lambda s: (s.task, s.scene), lambda _chosen: self.close(keeps=True))
         bindings.show(lambda s: s.arm, lambda _arm: self._again())
+        bindings.show(lambda _: None if bindings.frame is None else bindings.frame.task, self._learned)
 
         @self.upload.on_upload
         async def _(_event: viser.GuiEvent) -> None:
@@ -146,14 +149,31 @@ class OpenPanel:
         dropdown("topic", "Topic", (NO_COLUMN,), partial(self._answer, "topic"), "of the bag, or frame, of the hand")
         return found
 
-    def close(self, *, learns: bool = False) -> None:
-        """Let go of what is open, and show what was shown before, or what it `learns` once that is known."""
+    def close(self, *, keeps: bool = False, learns: bool = False) -> None:
+        """Let go of what is open, and show what was shown before, or what it `learns` once that is known.
+
+        What was taught and is not learned yet is kept for the next time if it `keeps` or `learns` it: learning may be
+        cancelled, or fail.
+        """
         with self._changing:
-            seen, self._seen, self._opened = self._seen, None, Opened()
+            if not self.folder.visible:
+                return
             self.folder.visible = False
+            kept = self._opened if (keeps or learns) and self._opened.taught else Opened()
+            seen, self._seen, self._opened = self._seen, None, kept
+            frame = self._bindings.frame
+            self._learned(None if frame is None else frame.task)
             self._draw()
+            self._put_beside()
             if seen is not None:
                 self._show(None, None if learns else 0)
+
+    def _learned(self, task: Task | None) -> None:
+        """Let go of what was learned from, once its task is shown."""
+        with self._changing:
+            lesson = None if task is None else task.lesson
+            if lesson is not None and lesson.takes == self._opened.taught and not self.folder.visible:
+                self._opened = Opened()
 
     def load(self, name: str, content: bytes) -> None:
         """Have a file taken, or added to what is open; say why that cannot be."""
@@ -176,38 +196,82 @@ class OpenPanel:
                 session.say(f"{name}: files: found {size / 1e6:.1f} MB in all; accepted: {accepted}", Severity.ALARM)
             else:
                 self._opened, self.folder.visible = replace(self._opened, files=files), True
+                self._put_beside()
                 session.jobs.submit(LANE, self._read)
 
     def teach(self) -> None:
-        """Open the folder for takes that are taught, beside those of files if there are any."""
+        """Open the folder for takes that are taught, beside those that are open, or that the shown task is made of."""
+        task = self._bindings.session.task
         with self._changing:
-            self.folder.visible = True
-            if self._seen is None:
-                self._put(self._opened, Preview(()))
+            if self.folder.visible:
+                if self._seen is None:
+                    self._put(self._opened, Preview(()))
+            elif task.lesson is not None and not self._opened.taught:
+                self._open(Opened.again(task.lesson, task.preparation))
+            else:
+                self._open(self._opened)
+
+    def reopen(self, lesson: Lesson) -> None:
+        """Open takes that were taught before, in place of what is open; Undo brings others back."""
+        before = self.lesson
+        self._open(replace(Opened.again(lesson), past=() if before is None else (before,)))
+
+    @property
+    def lesson(self) -> Lesson | None:
+        """What is taught and not learned yet, as it is without files; None if that is nothing."""
+        opened = self._opened
+        return Lesson(opened.taught, () if opened.files else opened.lesson.left_out) if opened.taught else None
+
+    def _open(self, opened: Opened) -> None:
+        """Open what was opened and taught before."""
+        with self._changing:
+            self._opened, self.folder.visible = opened, True
+            self._put_beside()
+            self._put(opened, Preview(()))
+            self._bindings.session.jobs.submit(SEEING, self._see, latest=True)
+
+    def _put_beside(self) -> None:
+        """Have Undo and Redo act on what is open, if something is."""
+        undo, redo = (partial(self.later, partial(self._travel, move)) for move in (Opened.undone, Opened.redone))
+        beside = Beside(self._opened.steps, undo, redo) if self.folder.visible else None
+        self._bindings.session.put_beside(beside)
+
+    def _teach(self, opened: Opened) -> None:
+        """Go on with other takes that are taught, if the folder is still open."""
+        if self.folder.visible and opened is not self._opened:
+            self._opened = opened
+            self._put_beside()
+            self._bindings.session.jobs.submit(SEEING, self._see, latest=True)
+
+    def _travel(self, moved: Callable[[Opened], Opened]) -> None:
+        """Undo or redo a take."""
+        with self._changing:
+            self._teach(moved(self._opened))
 
     def add(self, kind: str, stroke: Stroke, board: Slice | None) -> None:
-        """Keep a stroke, on a board or in space, as a take of a kind, or say why it is none."""
-        numbers = [int(each.take.name.rpartition(" ")[2]) for each in self._opened.taught]
+        """Keep a stroke, on a board or in space, as a take of a kind, or say why that cannot be."""
+        numbers = [int(each.name.rpartition(" ")[2]) for each in self._opened.taught]
+        if len(numbers) >= MAX_TAKES:
+            text = f"There are {MAX_TAKES} takes, the most for a task: delete one first."
+            self._bindings.session.say(text, Severity.WARNING)
+            return
         try:
             kept = taught(f"{kind} {max(numbers, default=0) + 1}", stroke, board)
         except DataError as error:
             self._bindings.session.say(str(error), Severity.WARNING)
             return
         with self._changing:
-            if self.folder.visible:
-                self._opened = replace(self._opened, taught=(*self._opened.taught, kept))
-                self._bindings.session.jobs.submit(SEEING, self._see, latest=True)
+            self._teach(self._opened.with_take(kept))
 
     def _delete(self) -> None:
         """Delete the take that is chosen, if it was taught."""
         with self._changing:
-            self._opened = self._opened.without(self._number, self._named)
-            self._bindings.session.jobs.submit(SEEING, self._see, latest=True)
+            self._teach(self._opened.without(self._number, self._named))
 
     def _again(self) -> None:
         """Read what is open for another arm: its joints' angles lead elsewhere, and it reaches other places."""
         with self._changing:
-            if self._opened.files or self._opened.taught:
+            if self.folder.visible and (self._opened.files or self._opened.taught):
                 self._opened, self._seen = replace(self._opened), None  # what is being inspected is not put
                 self._draw()
                 lane, work = (LANE, self._read) if self._opened.files else (SEEING, self._see)
@@ -280,7 +344,7 @@ class OpenPanel:
 
     def _put(self, opened: Opened, seen: Preview) -> None:
         with self._changing:
-            if self._opened is opened and seen is not self._seen:
+            if self._opened is opened and seen is not self._seen and self.folder.visible:
                 self._seen = seen
                 self._draw()
 
@@ -345,7 +409,7 @@ class OpenPanel:
         self._offer("take", titles, titles[-1] if newest else before.value)
         number, settings = self._number, opened.choices.preparation
         self._turn("chosen", not titles or seen.takes[number].is_chosen, shown=bool(titles))
-        self.controls["delete"].handle.visible = self._named in [each.take.name for each in opened.taught]
+        self.controls["delete"].handle.visible = self._named in [each.name for each in opened.taught]
         self.controls["download"].handle.visible = bool(opened.taught)
         found = {finding.kind for take in seen.takes for finding in take.inspection.findings}
         for kind, (name, *_) in SWITCHES.items():

@@ -22,7 +22,7 @@ from dt_viz.scenario.stack import (
     with_transform,
 )
 from dt_viz.session.frame import Frame, Stage
-from dt_viz.session.progress import Pace, Progress
+from dt_viz.session.progress import Message, Pace, Progress
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.scene.palette import Colour, ink, paper
@@ -180,7 +180,8 @@ def remedy(frame: Frame, progress: Progress) -> Remedy | None:
         return Remedy("Complete the warp", {"warp": 1.0})
     found = concerns(frame, wanted.view)
     mends = None if frame.blocked or not found else _against(found[0].kind.mend, found[0].source, wanted)
-    return UNDO if mends is None and progress.steps[0] and (frame.blocked or found) else mends
+    undoes = progress.steps[0] and progress.beside is None
+    return UNDO if mends is None and undoes and (frame.blocked or found) else mends
 
 
 def _against(mend: Mend | None, source: str, scenario: Scenario) -> Remedy | None:
@@ -366,6 +367,11 @@ class StatusLine:
         bindings.on(self.cancel, lambda session, _pressed: session.cancel())
         bindings.on(self.mend, lambda session, _pressed: self._mend(session))
 
+    @property
+    def message(self) -> Message | None:
+        """The message that was told last; None if none was, or it has passed."""
+        return None if self._told is None else self._told.message
+
     def tell(self, progress: Progress) -> None:
         """Show what is known of what is wanted; called by one thread after the other."""
         known, below = verdict(progress), ""
@@ -377,7 +383,7 @@ class StatusLine:
             (fraction, text), severity = progress.learning, Severity.NOTE
             below = progress_html(fraction)
         self._told, frame = progress, progress.shown
-        self.steps.content = steps_html(progress.steps)
+        self.steps.content = steps_html(progress.steps if progress.beside is None else progress.beside)
         mends = None
         if frame is not None and progress.message is None and not progress.stale:
             mends = remedy(frame, progress)
