@@ -55,7 +55,13 @@ class Storage(Protocol):
 class Keeper:
     """Keeps the scenario and the camera of one visitor in his browser: the newest, at most twice a second."""
 
-    def __init__(self, storage: Storage, known: Known, present: Callable[[Collection[str]], Saved]) -> None:
+    def __init__(
+        self,
+        storage: Storage,
+        known: Known,
+        present: Callable[[Collection[str]], Saved],
+        otherwise: Saved | None = None,
+    ) -> None:
         """Ask the browser what it keeps, for `PATIENCE` at most.
 
         Args:
@@ -63,8 +69,9 @@ class Keeper:
             known: names of what there is on this page.
             present: says what is there now, with the task's demonstrations if it is none of some names; asked once
                 there is a session.
+            otherwise: what the page begins with where the browser keeps nothing; None is what the session begins with.
         """
-        self._storage, self._known, self._present = storage, known, present
+        self._storage, self._known, self._present, self._otherwise = storage, known, present, otherwise
         self._session: Session | None = None
         self._said: list[str] = []
         """What the visitor has been told, or will be once there is a session."""
@@ -91,11 +98,13 @@ class Keeper:
         self._written = self._text()
         for text in trouble:
             session.say(text, Severity.WARNING)
-        if BLOCKED in trouble:
-            return
-        self._session, self._resume = session, resume
         begun = self.begun
         late = None if begun is None or (begun.scenario == session.scenario and begun.lesson is None) else begun
+        if BLOCKED in trouble:
+            if late is not None:
+                resume(late)
+            return
+        self._session, self._resume = session, resume
         if late is not None or self._attempts:
             self._first = session.scenario
         if late is not None:
@@ -144,6 +153,7 @@ class Keeper:
         except DataError as error:
             self._storage.remove_item(KEY)
             self._say(f"The page begins anew. {error}")
+        self.begun = self.begun or self._otherwise
         return True
 
     def _waits(self, session: Session) -> bool:

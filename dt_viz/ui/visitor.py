@@ -129,7 +129,7 @@ class Visitor(Display):
         self._studio = Studio(self.pictures, lambda: self.robot, self._changing)
         titled = {"": robot.title} if arms is None else arms.titles
         pen = Pen(self.pictures, lambda: self.robot, lambda: self.session, self._face)
-        self._keeper = Keeper(client.local_storage, known_names(titles, titled), self._made)
+        self._keeper = Keeper(client.local_storage, known_names(titles, titled), self._made, begins)
         self._camera = CameraController(client, lambda: self.robot.hand, robot.size, self._keeper.changed)
         self._panel = ControlPanel(
             client.gui,
@@ -155,18 +155,12 @@ class Visitor(Display):
             client.local_storage,
             self._came_back,
         )
-        later = begins if self._keeper.begun is None else None
-        if later is not None and not _takes_long(later):
-            self._keeper.go_on(later)
-            later = None
         begun = self._keeper.begun
         at_once = None if begun is None or _takes_long(begun) else begun.scenario
         display = self if share is None else Counted(self, share)
         self.session = Session(engine, initial_scenario, task, display, arms and arms.engine, at_once, account)
         self._panel.connect(self.session)
         self._keeper.begin(self.session, self._resume)
-        if later is not None:
-            self._resume(later)
         self._panel.tour.begin(self.session)
         self.ruler = Ruler(scenarios)
         """What the visitor's window is measured with."""

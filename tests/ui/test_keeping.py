@@ -578,6 +578,27 @@ def test_a_new_visitor_begins_with_the_servers_demonstrations_once(opened_for, k
     assert page["Task"].value == "Your data"
 
 
+@pytest.mark.parametrize("begins", [Saved(replace(MADE, warp=0.25)), own_of()], ids=["at once", "with demonstrations"])
+@pytest.mark.parametrize("keeps", [True, False])
+def test_the_servers_scenario_waits_for_what_a_slow_browser_tells(opened_for, begins, keeps):
+    browser = Slow(**({KEY: made()} if keeps else {}))
+    page = opened_for(browser, begins=begins)
+    look_from_the_top(page)
+    assert page.session.scenario.task == "draw_s" and browser.told == []
+    browser.answers = True
+    warp = MADE.warp if keeps else begins.scenario.warp
+    wait_until(lambda: page.session.scenario.warp == warp and page.session.scenario.task != "draw_s")
+    settled(page)
+    assert page.session.jobs.wait_idle(CHOICES, PATIENCE)
+    assert page.session.scenario.warp == warp and all(kept_of.warp == warp for kept_of in texts(browser))
+
+
+def texts(browser: Browser) -> list[Scenario]:
+    """Scenarios that a browser was told to keep."""
+    known = Known((*TITLES, OWN))
+    return [decode(text, known).scenario for _, text in browser.told]
+
+
 def test_a_link_opens_a_scenario_that_the_server_offers_by_its_name(opened_for):
     page = opened_for(Browser(), scenarios={"lesson-1": Saved(MADE, SIGHT), "lesson-2": own_of()})
     for name, task in (("lesson-1", MADE.task), ("lesson-2", "own_data_1"), ("../lesson-1", "own_data_1")):
