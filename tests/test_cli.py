@@ -49,6 +49,7 @@ async def visit_and_stop(process, url, number):
             assert CLOSING in client.notices
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)], ids=["SIGTERM", "Ctrl-C"]
 )
@@ -58,6 +59,7 @@ def test_a_signal_ends_it_cleanly_while_visitors_drag(cache, number):
         assert_ends_cleanly(process)
 
 
+@pytest.mark.long
 def test_a_signal_ends_it_cleanly_while_it_learns(tmp_path):
     with started(tmp_path, "--processes", "1") as process:
         address(process)  # it answers meanwhile

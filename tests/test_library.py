@@ -142,6 +142,7 @@ def test_a_covered_goal_of_a_drawing_is_left_in_the_plane(letter):
     assert abs(box.signed_distance(end)) < 2e-3 and 0.04 < np.linalg.norm(around.goal - letter.goal) < 0.07
 
 
+@pytest.mark.long
 def test_transforms_are_stacked_in_any_order(letter):
     x, y = middle_of(letter)
     target = (float(x) + 0.05, float(y) + 0.04, 0.0)
@@ -200,6 +201,7 @@ def test_the_controller_reads_the_motion_that_it_saved_and_moves_as_before(push,
     assert printed[0] == printed[1] and "distance from the goal" in printed[0]
 
 
+@pytest.mark.long
 def test_the_plot_is_drawn(tmp_path, monkeypatch):
     monkeypatch.setenv("MPLBACKEND", "Agg")
     plot.main(str(tmp_path / "plot.png"))
@@ -216,6 +218,7 @@ def test_the_scene_draws_its_paths_around_the_ball_where_it_stands(server, push)
     server.scene.reset()
 
 
+@pytest.mark.long
 def test_the_arm_in_the_loop_gives_way_to_a_ball_that_crosses_and_arrives(push):
     arm, model = dt.load_jaco(), load_jaco().collision
     joints, places = arm_controller.run(push, arm)

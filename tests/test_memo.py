@@ -73,6 +73,7 @@ class Blank:
         return lambda *_, **__: None
 
 
+@pytest.mark.long
 def test_one_thread_alone_computes_for_a_session(new_engine, initial, monkeypatch):
     """Its worker, whoever edits, asks for the task, pushes, holds or moves the arm."""
     users, compute = set(), Memo.__call__

@@ -57,6 +57,7 @@ def assert_moves_as(motion, solved):
         np.testing.assert_allclose(path.positions[[0, -1]], ends[:, :3], atol=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_a_scenario_moves_in_the_library_as_on_the_page_and_is_the_same_file_again(name, engine, tmp_path):
     scenario = SCENARIOS[name]
@@ -67,6 +68,7 @@ def test_a_scenario_moves_in_the_library_as_on_the_page_and_is_the_same_file_aga
     assert (tmp_path / "b.json").read_bytes() == path.read_bytes()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("task", ["draw_j", "push_box"])
 def test_demonstrations_in_a_file_move_as_on_the_page(task, new_engine, tmp_path):
     engine = new_engine()
@@ -114,6 +116,7 @@ def on_page(motion, folder, new_engine):
     return engine, own, scenario, engine.solved(scenario, FINE)
 
 
+@pytest.mark.long
 def test_a_saved_motion_in_space_is_the_same_on_the_page_and_goes_on_as_a_scenario(tmp_path, new_engine):
     ball = dt.Sphere((-0.02, -0.31, 0.33), 0.08)
     motion = dt.fit([*arcs(3)], settings=dt.ImitationSettings(num_layers=2)).stack(

@@ -69,6 +69,7 @@ def test_a_browser_that_opens_nothing_is_given_up(does, said, capsys, tmp_path, 
     assert [*tmp_path.iterdir()] == [browser]
 
 
+@pytest.mark.long
 def test_a_scene_and_a_step_of_the_tour_are_drawn_as_lines_and_text(tmp_path, cache, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
     assert main(["picture", "fig-2", "--out", str(tmp_path / "f.svg")]) == 0
@@ -97,6 +98,7 @@ def test_a_saved_scenario_is_recorded_with_its_demonstrations_its_arm_and_its_ca
     assert "a.json: warp: found 7; accepted: 0 to 1\n" in capsys.readouterr().err
 
 
+@pytest.mark.long
 @needs_chromium
 @pytest.mark.browser
 def test_a_scene_is_rendered_in_any_size_and_seen_whole(tmp_path, cache, monkeypatch, request):

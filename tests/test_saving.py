@@ -114,6 +114,7 @@ print(digest.hexdigest())
 """
 
 
+@pytest.mark.long
 def test_other_processes_find_the_same(motions, tmp_path):
     motions["plane"].save(tmp_path / "a.npz")
     command = [sys.executable, "-c", DIGEST, str(tmp_path / "a.npz")]

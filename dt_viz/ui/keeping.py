@@ -72,7 +72,8 @@ class Keeper:
             otherwise: what the page begins with where the browser keeps nothing; None is what the session begins with.
         """
         self._storage, self._known, self._present, self._otherwise = storage, known, present, otherwise
-        self._session: Session | None = None
+        self._page: tuple[Session, Callable[[Saved], None]] | None = None
+        """The session, and what has it go on with something."""
         self._said: list[str] = []
         """What the visitor has been told, or will be once there is a session."""
         self._found: str | None = None
@@ -104,7 +105,7 @@ class Keeper:
             if late is not None:
                 resume(late)
             return
-        self._session, self._resume = session, resume
+        self._page = session, resume
         if late is not None or self._attempts:
             self._first = session.scenario
         if late is not None:
@@ -130,14 +131,16 @@ class Keeper:
 
     def changed(self) -> None:
         """Keep what is there now, soon. Never blocks for long."""
-        if self._session is not None:  # the newest of these does what those before it would have done
-            self._session.jobs.submit(LANE, partial(self._keep, self._session), latest=True)
+        if self._page is not None:  # the newest of these does what those before it would have done
+            session, _resume = self._page
+            session.jobs.submit(LANE, partial(self._keep, *self._page), latest=True)
 
     def forget(self) -> None:
         """Keep nothing until the next edit."""
-        if self._session is not None:
+        if self._page is not None:
             self._first = None
-            self._session.jobs.submit(LANE, self._remove, latest=True)
+            session, _resume = self._page
+            session.jobs.submit(LANE, self._remove, latest=True)
 
     def _ask(self) -> bool:
         """Ask the browser what it keeps, which then is `begun`; return whether it has answered."""
@@ -164,7 +167,7 @@ class Keeper:
             self._first = None
         return self._first is not None
 
-    def _keep(self, session: Session) -> None:
+    def _keep(self, session: Session, resume: Callable[[Saved], None]) -> None:
         """Ask the browser, until it tells, what it keeps, and go on with that; once that is done, write what is new."""
         while self._attempts and self._waits(session) and not session.jobs.closed:
             self._attempts -= 1
@@ -174,7 +177,7 @@ class Keeper:
                 if self.begun is None or not self._waits(session):
                     self.begun = self._first = None
                 else:
-                    self._resume(self.begun)
+                    resume(self.begun)
         if not self._waits(session):
             self._write(session)
 
@@ -216,8 +219,9 @@ class Keeper:
         """Tell the visitor, once."""
         if text not in self._said:
             self._said.append(text)
-            if self._session is not None:
-                self._session.say(text, Severity.WARNING)
+            if self._page is not None:
+                session, _resume = self._page
+                session.say(text, Severity.WARNING)
 
 
 def _short(saved: Saved) -> str | None:

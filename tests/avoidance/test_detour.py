@@ -47,6 +47,7 @@ def angle(a, b):
     return np.degrees(np.arccos(np.clip(a @ b, -1, 1)))
 
 
+@pytest.mark.long
 @given(seeds)
 def test_directions_are_unit_vectors_no_two_alike_the_least_detour_first(seed):
     points, radius, obstacle = collision(seed)

@@ -39,6 +39,7 @@ def test_in_single_precision_the_round_trip_is_exact_and_points_move_by_less_tha
     assert np.linalg.norm(exact.transform.forward(points) - points, axis=1).max() > 0.01  # it is not the identity
 
 
+@pytest.mark.long
 def test_rollouts_are_motions_of_the_velocity_until_it_turns_fast_near_the_goal(task, exact):
     (path,), (times,) = exact.rollouts(task.starts[:1], 3e-4)
     even = np.linspace(0, 0.5 * times[-1], 11)

@@ -78,6 +78,7 @@ class TestSurroundings:
                 least = min(least, points[..., 2].min())
         return least
 
+    @pytest.mark.long
     @pytest.mark.parametrize("shape", ["sphere", "box"])
     def test_a_line_is_free_only_where_no_vertex_of_the_meshes_enters_anything(self, problem, lines, shape):
         place = as_point(problem.task.mean_path[50])
@@ -90,6 +91,7 @@ class TestSurroundings:
                 assert self.depth(problem.robot, around.obstacle, *line) > 0
         assert 3 < sum(verdicts) < 27
 
+    @pytest.mark.long
     def test_what_is_far_from_everything_is_free(self, problem, lines):
         model = load_jaco().collision
         far, nothing = (PlanningScene(problem.robot, Union(parts)) for parts in ((Sphere((5.0, 0.0, 0.0)),), ()))
@@ -99,6 +101,7 @@ class TestSurroundings:
             if self.depth(problem.robot, far.obstacle, *line) > 1e-3 and (itself is None or itself.distance > 0):
                 assert nothing.is_free(*line)
 
+    @pytest.mark.long
     def test_nothing_between_two_samples_is_passed_through(self, problem, lines):
         free = [line for line in lines if PlanningScene(problem.robot, Union()).is_free(*line)]
         assert len(free) > 10
@@ -110,6 +113,7 @@ class TestSurroundings:
             speck = Union((Sphere(as_point(place), 0.0005),))
             assert not PlanningScene(problem.robot, speck).is_free(start, end)
 
+    @pytest.mark.long
     def test_the_arm_may_not_pass_through_itself_or_the_table(self, problem):
         nothing, model, rng = PlanningScene(problem.robot, Union()), load_jaco().collision, np.random.default_rng(1)
         seen = set()

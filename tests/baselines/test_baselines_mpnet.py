@@ -116,6 +116,7 @@ class TestPlanning:
             np.testing.assert_allclose(a, b, atol=1e-9)
         assert not plan.warnings
 
+    @pytest.mark.long
     def test_a_run_repeats_and_says_what_collides(self, problem, in_the_way):
         first, second = (mpnet.fit(problem)(in_the_way, problem.task.starts[:1]) for _ in range(2))
         (q,) = joints_of(first)
@@ -186,6 +187,7 @@ class TestTraining:
         with pytest.raises(NotFittedError, match="does not move"):
             steps(replace(problem, postures=(problem.postures[0], still)))
 
+    @pytest.mark.long
     def test_what_training_returns_can_be_planned_with(self, problem):
         lines = []
         model = Network.of(train(problem, 100, lines.append))

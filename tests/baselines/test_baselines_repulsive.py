@@ -77,6 +77,7 @@ def test_steps_follow_the_sum_of_both_velocities_and_eflow_goes_on_after_them(ta
     assert np.linalg.norm(path[-1] - planner.system.goal) < 1e-6
 
 
+@pytest.mark.long
 def test_finer_steps_converge(task, planner, beside):
     several = (RepulsionSettings(rate) for rate in (20.0, 200.0, 400.0, 800.0))
     *paths, finest = (replace(planner, settings=s)(beside, task.starts[:1]).paths[0] for s in several)

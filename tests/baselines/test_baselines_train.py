@@ -46,6 +46,7 @@ def test_weights_are_written_for_the_method_to_read_and_the_table_says_how_near_
     assert load_system(TASKS["draw_s"](), tmp_path).goal.shape == (3,)
 
 
+@pytest.mark.long
 def test_in_folds_each_demonstration_is_compared_with_what_was_learned_from_others(monkeypatch, tmp_path, capsys):
     learned, compared = [], []
     monkeypatch.setattr(train, "frechet", lambda paths, references: compared.append(references) or np.ones(len(paths)))

@@ -76,6 +76,7 @@ def _live(engine, initial):
     return Robot(engine, initial)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("seed", "num"), [(0, 1200), *(pytest.param(k, 5000, marks=pytest.mark.slow) for k in range(1, 20))]
 )
@@ -119,6 +120,7 @@ def test_a_sphere_dropped_on_the_arm_at_rest_is_said_and_left(live):
     live.goes_on()
 
 
+@pytest.mark.long
 def test_two_spheres_that_close_in_from_both_sides(live):
     live.run(1.5)
     for gap in np.linspace(0.4, 0.1, 60):
@@ -127,6 +129,7 @@ def test_two_spheres_that_close_in_from_both_sides(live):
     live.goes_on()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("task", ["push_box", pytest.param("lift_box", marks=pytest.mark.slow)])
 def test_a_robot_that_is_pushed_down_does_not_go_into_the_table(engine, initial, task):
     live = Robot(engine, initial, task)
@@ -145,6 +148,7 @@ def test_a_robot_that_is_pushed_down_does_not_go_into_the_table(engine, initial,
     live.goes_on()
 
 
+@pytest.mark.long
 def test_a_robot_that_is_folded_does_not_touch_itself(live):
     rng, model, closest, said = np.random.default_rng(1), load_jaco().collision, np.inf, set()
     live.run(1.0)
@@ -158,6 +162,7 @@ def test_a_robot_that_is_folded_does_not_touch_itself(live):
     live.goes_on()
 
 
+@pytest.mark.long
 def test_links_come_near_the_table_and_each_other_no_faster_than_is_reckoned_with(live):
     body, postures = live.robot.body, np.random.default_rng(0).uniform(-np.pi, np.pi, (300, 6))
     for make in (ContactLimit.table, ContactLimit.itself):

@@ -124,6 +124,7 @@ class TestArrival:
         near = load_jaco().collision.nearest_to_obstacle(np.array(robot.passed)[::5], solved.scenario.obstacle)
         assert near.distance > 0.8 * MARGIN
 
+    @pytest.mark.long
     def test_it_rests_only_once_the_way_around_a_sphere_has_come_to_that_of_the_end(self, engine):
         ball = Sphere((0.042637, -0.469151, 0.353698), 0.112008)
         solved = engine.solved(avoiding("drop_pots", ball, space="cspace", margin=0.01), LIVE)
@@ -179,6 +180,7 @@ class TestDisturbances:
         assert np.abs(robot.q - place).max() < 0.05  # no way back to where it was
         scene.assert_arrives(robot)
 
+    @pytest.mark.long
     def test_at_rest_it_steps_aside_and_comes_back(self, scene):
         robot = Robot(scene.controller(), scene.start).run(12, until=Phase.RESTING)
         model, closest = load_jaco().collision, np.inf

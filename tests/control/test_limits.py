@@ -81,6 +81,7 @@ def test_less_is_kept_where_less_is_asked_for_and_nothing_without_obstacles(arm,
         assert slopes.shape == (0, 6) and not len(bounds) and nearest == np.inf
 
 
+@pytest.mark.long
 def test_who_obeys_brakes_before_the_range_ends_and_keeps_speed_and_acceleration(arm):
     """Random wishes for 10⁵ ticks, many of them towards a limit."""
     robot, rng, acceleration = arm.robot, np.random.default_rng(2), 4.0

@@ -66,6 +66,7 @@ def on_urdf(robot, q, ball):
     return min(least)
 
 
+@pytest.mark.long
 def test_clearance_is_that_of_the_urdfs_shapes_whatever_the_spheres_are_that_the_arm_avoids_with(robot, engine, fits):
     task = engine.task(TASK)
     ball = Sphere(as_point(task.mean_path[50] + [0, 0, 0.14]), 0.1)
@@ -83,6 +84,7 @@ def test_clearance_is_that_of_the_urdfs_shapes_whatever_the_spheres_are_that_the
     assert place.clearance < 5e-3 and on_urdf(robot, q, ball) == pytest.approx(place.clearance, abs=2e-3)
 
 
+@pytest.mark.long
 def test_the_command_has_a_row_for_each_arm_and_writes_what_it_is_made_from(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(arms, "NUM_FRAMES", 4)
     out, tables = tmp_path / "arms.npz", tmp_path / "tables.json"
@@ -125,6 +127,7 @@ def test_what_is_missed_counts_against_an_arm():
     assert np.isnan(arms._row([none])["least mm"]) and arms._row([none])["others with a way"] == 0
 
 
+@pytest.mark.long
 def test_balls_at_the_goal_the_base_or_around_the_hand_are_told_from_those_that_can_be_passed(
     small, small_engine, ball
 ):

@@ -95,6 +95,7 @@ def test_it_is_said_why_there_is_no_motion(around, middle, lasa, tmp_path, capsy
         assert f"no motion: {reason}" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_random_places_are_measured_and_repeat(measured):
     arrays, rows, figures = split(measured("around", "--count 2 --size 0.1"))
     assert np.linalg.norm(arrays["places"] - arrays["places"][0], axis=2).max() <= 0.05
@@ -116,6 +117,7 @@ def test_places_of_the_hand_are_measured_at_its_point_and_compared_with_what_is_
     assert [median, p95] == pytest.approx(np.percentile(forced, [50, 95]), abs=0.006)
 
 
+@pytest.mark.long
 def test_places_are_any_shapes_of_any_size_along_the_whole_motion(lasa, measured):
     shapes = "--shape any --number 2 --size 0.06,0.25 --no-avoidance"
     arrays = measured("around", f"--count 12 --along 0,1 --spread 0 {shapes}")[0]

@@ -67,6 +67,7 @@ def test_what_is_found_again_just_after_a_choice_is_not_compared():
 # --- capacity ---
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("num_visitors", [1, 12])
 def test_a_simulated_process_answers_as_many_in_time_as_on_paper_while_it_has_time(num_visitors):
     cost = Cost(picture=0.04, looking=0.01, dragging=0.05)
@@ -284,6 +285,7 @@ def test_rollouts_are_compared_without_and_with_an_obstacle(exact):
 # --- off the demonstrations ---
 
 
+@pytest.mark.long
 def test_what_is_off_course_is_told_of_a_motion_that_is_spoilt():
     demonstrations = TASKS["draw_s"]().demonstrations
     good = off_course("S", demonstrations, fit_augmented(demonstrations))
@@ -347,6 +349,7 @@ def test_a_command_that_fails_is_written_down_the_others_are_measured_and_the_si
     assert main(["--out", str(tmp_path), "--only", "two"]) == 0
 
 
+@pytest.mark.long
 def test_commands_run_in_processes_of_their_own_and_their_tables_come_back(lasa, tmp_path):
     result = sitting.ran(["imitation", str(lasa / "Hook.mat")], tmp_path / "imitation-0")
     assert result["status"] == 0 and result["seconds"] > 0 and result["tables"][0][0]["name"] == "Hook"

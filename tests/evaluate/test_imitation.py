@@ -49,6 +49,7 @@ def test_the_figures_of_imitation_can_be_computed_again_from_the_arrays(imitated
     assert figures["rms_mm"] == pytest.approx(np.mean(rms), rel=1e-6)
 
 
+@pytest.mark.long
 def test_imitation_takes_other_files_in_metres_and_in_space(tmp_path):
     times, positions = hook(0)
     lifted = np.column_stack([positions, 10 * np.linspace(1, 0, len(times)) ** 2]) / 100  # some 0.5 m
@@ -111,6 +112,7 @@ def test_imitation_writes_each_rollout_in_the_unit_of_the_file_from_start_to_goa
     assert (green - red > 50).sum() > 500 and (red - green > 100).sum() > 500  # demonstrations and rollouts
 
 
+@pytest.mark.long
 def test_the_worst_of_what_was_held_out_is_drawn(left_out, monkeypatch, lasa, tmp_path):
     assert (left_out / "worst.png").read_bytes().startswith(b"\x89PNG")
     drawn = []
@@ -196,6 +198,7 @@ def test_a_shape_that_cannot_be_fitted_does_not_keep_the_others_from_it(lasa, tm
     assert (tmp_path / "out" / "Hook.npz").exists() and not (tmp_path / "out" / "space.npz").exists()
 
 
+@pytest.mark.long
 def test_what_was_chosen_and_the_trivial_way_are_printed(lasa, tmp_path, capsys):
     recorded = [hook(i) for i in range(4)]
     save_demonstrations(
@@ -212,6 +215,7 @@ def test_what_was_chosen_and_the_trivial_way_are_printed(lasa, tmp_path, capsys)
     assert f"{row['of_mean']:.3f} at worst" in printed
 
 
+@pytest.mark.long
 def test_the_hands_orientation_is_measured_beside_the_mean_of_the_others(tmp_path, capsys):
     takes = turning_takes(4)
     save_demonstrations(tmp_path / "turning.npz", takes)

@@ -149,6 +149,7 @@ def test_who_is_lost_saw_nothing_for_the_rest_of_the_drag(visit):
     assert nothing["pictures_per_s"] == 0 and nothing["gap_ms"]["worst"] == pytest.approx(1e4)
 
 
+@pytest.mark.long
 def test_all_visitors_who_come_and_drag_at_once_are_shown_their_last_edit(tmp_path, capsys, url):
     out = tmp_path / "load.json"
     arguments = ["--clients", "1", f"{NUM_VISITORS}", "--seconds", "0.5", "--url", url, "--out", str(out)]

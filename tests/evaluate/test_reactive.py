@@ -11,6 +11,7 @@ from dt_viz.obstacles.shapes import UPRIGHT, Sphere, as_point
 from dt_viz.robot.models import load_jaco
 
 
+@pytest.mark.long
 def test_reactive_writes_what_its_figures_are_computed_from_and_repeats(measured, robot):
     arrays, (rows,) = measured("reactive", "--speed 0.4 --runs 1")
     row = rows[0]
@@ -43,6 +44,7 @@ def bench(engine):
     return reactive.Bench(engine, "draw_s", 0.15, 0.03)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("speed", "num"), [(0.1, 1), (1.0, 1), (0.5, 2)])
 def test_spheres_cross_the_motion_when_the_hand_is_there(bench, speed, num):
     found = list(islice(reactive.crossings(bench, speed, seed=1, num=num), 3))

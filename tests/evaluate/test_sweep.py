@@ -96,6 +96,7 @@ def test_a_cluster_that_loses_a_worker_writes_what_one_process_does(commands, cl
     assert len(killed) == 1
 
 
+@pytest.mark.long
 def test_an_item_that_ends_its_worker_is_computed_again_as_one_process_does(cluster, tmp_path):
     matrices = [np.random.default_rng(k).normal(size=(90, 90)) for k in range(5)]
 
@@ -129,6 +130,7 @@ def test_an_item_that_ends_each_worker_is_given_up_and_workers_with_other_thread
         list(swept(lambda _, k: k, range(2)))
 
 
+@pytest.mark.long
 def test_each_worker_computes_what_one_process_does_keeps_what_items_share_and_its_errors_and_its_end_are_told():
     pytest.importorskip("joblib")
 
@@ -154,6 +156,7 @@ def test_each_worker_computes_what_one_process_does_keeps_what_items_share_and_i
             list(swept(end, range(2)))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("given", "message"),
     [

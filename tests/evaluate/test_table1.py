@@ -73,6 +73,7 @@ def test_cells_are_those_of_the_arrays_beside_them(folder, table, method):
     assert set(cells) == set(table1.COLUMNS)
 
 
+@pytest.mark.long
 def test_the_paper_stands_beside_what_is_known_of_it(table):
     assert table["linear"]["push_box"]["frechet"]["paper"] == 0.242
     assert table["linear"]["push_box"]["turn"]["paper"] is None

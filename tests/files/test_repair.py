@@ -51,6 +51,7 @@ def _coarsely():
         yield
 
 
+@pytest.mark.long
 @given(st.sampled_from(sorted(SHAPES)), st.sampled_from([0.0, 0.01, 0.05]), st.integers(0, 2**32 - 1))
 @settings(max_examples=12)
 def test_a_mesh_with_missing_and_turned_triangles_is_the_same_solid(name, missing, seed):

@@ -63,6 +63,7 @@ def test_what_is_refused_says_why_in_one_line():
         read_upload(Triangles, [("a.3mf", b"no archive")])
 
 
+@pytest.mark.long
 @LINUX
 @pytest.mark.usefixtures("kept")
 def test_the_readers_processor_time_is_charged_to_whoever_sent_the_file(reader):
@@ -74,6 +75,7 @@ def test_the_readers_processor_time_is_charged_to_whoever_sent_the_file(reader):
         assert 0.5 * number <= account.debt < 0.5 * number + 0.4
 
 
+@pytest.mark.long
 @LINUX
 @pytest.mark.parametrize(
     "hostile",
@@ -91,6 +93,7 @@ def test_what_it_does_beyond_its_limits_ends_it_and_nothing_else(reader, hostile
         read_mesh(BOX, "a.stl")
 
 
+@pytest.mark.long
 @LINUX
 def test_a_reader_that_ends_its_parent_is_ended_with_it(reader, tmp_path):
     reader("""
@@ -134,6 +137,7 @@ def test_nothing_is_unpickled_and_no_room_is_made_for_what_is_not_there(reader):
             read_upload(Triangles, [("a.stl", content)])
 
 
+@pytest.mark.long
 def test_the_first_line_of_an_answer_may_be_as_long_as_very_many_takes_make_it(reader):
     reader("""
         value = {"class": "Triangles", "vertices": "v", "faces": "f", "notes": ["x" * 10**7]}
@@ -189,6 +193,7 @@ def test_it_ends_when_its_visitor_leaves(reader):
         read_upload(Triangles, [("a.stl", bytes(10**7))], left.is_set)
 
 
+@pytest.mark.long
 def test_one_is_kept_while_somebody_may_send_a_file_and_none_is_left():
     """The test fails for what it leaves behind, too."""
     users = object(), object()
@@ -211,6 +216,7 @@ def test_one_is_kept_while_somebody_may_send_a_file_and_none_is_left():
     assert uploads._ready._process is None
 
 
+@pytest.mark.long
 def test_it_ends_by_itself_when_the_server_has_gone():
     process = uploads._Process()
     try:

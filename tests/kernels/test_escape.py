@@ -64,6 +64,7 @@ def test_clearance_is_that_of_array_operations(field, postures):
     np.testing.assert_allclose(ARM.clearance(postures, Union(field.obstacles)), expected, rtol=0, atol=1e-12)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", OBSTACLES.keys() - SIMILAR)
 def test_far_away_and_beyond_a_grid_distances_are_those_of_array_operations(name):
     q, body = ROBOT.home + np.random.default_rng(6).normal(0, 1.0, (50, 6)), cover(ARM.body)
@@ -75,6 +76,7 @@ def test_far_away_and_beyond_a_grid_distances_are_those_of_array_operations(name
     assert (ARM.clearance(q, Union(())) == np.inf).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("duration", [-0.7, 0.4])
 def test_runge_kutta_steps_are_those_of_array_operations(field, postures, duration):
     expected, _ = carried(Plain(field), postures, None, RK4, duration, 5)
@@ -82,6 +84,7 @@ def test_runge_kutta_steps_are_those_of_array_operations(field, postures, durati
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-11)
 
 
+@pytest.mark.long
 def test_adaptive_steps_are_as_exact_as_fine_runge_kutta_steps(field, postures):
     postures = postures[:20]
     before = postures.copy()

@@ -227,6 +227,7 @@ def test_any_number_of_points_gives_what_each_gives_alone(pair, num):
     np.testing.assert_allclose(ends, expected, rtol=0, atol=1e-12)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("step", [EULER, IMPLICIT_EULER, RK4])
 def test_steps_are_those_of_array_operations(pair, step):
     field, plain = pair

@@ -26,6 +26,7 @@ def postures(num, seed=0):
     return objectives, q, ROBOT.end_effector(q) + rng.normal(0, 0.2, (num, 3))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("gain", [0, 1])
 @pytest.mark.parametrize("num", [1, LANES - 1, LANES, 3 * LANES + 5])
 def test_a_step_is_that_of_array_operations(num, gain):
@@ -64,6 +65,7 @@ def test_postures_settle_one_by_one():
     np.testing.assert_array_equal(again[::-1], settled)  # whatever is beside it in a block
 
 
+@pytest.mark.long
 def test_a_walk_takes_a_step_a_stride():
     objectives, q, _ = postures(LANES + 3, seed=2)
     rng = np.random.default_rng(3)

@@ -82,6 +82,7 @@ def test_distances_are_those_of_trimesh(obstacle):
     assert (found < expected + 3e-3).all()  # never much more
 
 
+@pytest.mark.long
 def test_complex_steps_give_the_slope_and_change_nothing_else(obstacle):
     points = around(obstacle, 300, 1.5).reshape(3, 100, 3)
     distance, h = obstacle.signed_distance(points), 1e-6

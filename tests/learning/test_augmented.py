@@ -86,6 +86,7 @@ def test_motions_begin_and_end_exactly_and_take_their_time(task):
         assert np.linalg.norm(rollout[-1] - imitation.goal) < 0.01 * extent(demonstrations)
 
 
+@pytest.mark.long
 def test_left_out_demonstrations_are_predicted_better_than_by_their_mean():
     off, trivial = [], []
     for task in ("draw_s", "draw_j", "draw_g"):

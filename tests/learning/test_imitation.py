@@ -114,6 +114,7 @@ def mean_error(demonstrations, imitation):
     return np.mean([each.mean() for each in off])
 
 
+@pytest.mark.long
 def test_units_and_place_do_not_matter(learned):
     demonstrations, small = learned
     shift = np.arange(1.0, len(small.goal) + 1)
@@ -131,6 +132,7 @@ def test_a_single_demonstration_and_starts_on_opposite_sides_of_one_goal_are_eno
     assert mean_error(groups, fit(groups)) < largest_error
 
 
+@pytest.mark.long
 def test_a_motion_that_turns_twice_round_gets_more_layers():
     s = np.linspace(0, 1, 300)
     angle, radius = 4 * np.pi * (1 - s), 0.02 + 0.08 * (1 - s)
@@ -172,6 +174,7 @@ def test_velocity_objective_has_its_exact_gradient(dim):
     assert (ahead - back) / 2e-6 == pytest.approx(slope, rel=1e-7)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("dim", [2, 3])
 def test_velocity_objective_gives_a_stable_invertible_system_too(dim):
     imitation = fit(hooks(dim), ImitationSettings("velocity", max_iterations=5))
@@ -183,6 +186,7 @@ def test_velocity_objective_gives_a_stable_invertible_system_too(dim):
     np.testing.assert_array_equal(again.forward(imitation.starts), imitation.transform.forward(imitation.starts))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("objective", ["trajectory", "velocity"])
 def test_the_papers_preset_runs(objective):
     # ℓ = 0.005 for LASA in millimetres
@@ -253,6 +257,7 @@ def still(place=0.3):
     return Demonstration(np.linspace(0, 1, 50), np.full((50, 2), place), "still")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("demonstrations", "warning", "num_left", "largest_error"),
     [

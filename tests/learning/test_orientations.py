@@ -150,6 +150,7 @@ class TestMotion:
         off = apart(hand(usual), hand(turned))
         assert off[0] > 0.2 and off[-1] < 1e-6 and (np.diff(off) < 1e-9).all()
 
+    @pytest.mark.long
     def test_a_hand_in_the_loop_is_turned_to_the_goal(self):
         motion = dt.fit(TAKES)
         place, now, h = TAKES[0].positions[0], rotation(hand(TAKES[0])[60]), 0.02
@@ -168,6 +169,7 @@ class TestMotion:
         for one, other in zip(motion.rollouts(), dt.Motion.load(tmp_path / "turns.npz").rollouts(), strict=True):
             np.testing.assert_array_equal(hand(one), hand(other))
 
+    @pytest.mark.long
     def test_what_does_not_learn_it_says_so(self):
         plain = dt.fit(TAKES, state="plain")
         assert plain.rollouts()[0].orientations is None and "not learned in the plain state" in plain.report()
@@ -205,6 +207,7 @@ class TestOthersStarts:
             [each.degrees["mean"] for each in followed]
         )
 
+    @pytest.mark.long
     def test_they_are_learned_from_starts_where_these_explain_them_and_else_are_the_mean(self):
         assert self.off(explained=True) < 0.6
         assert self.off(explained=False) < 1.08

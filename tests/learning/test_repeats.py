@@ -66,6 +66,7 @@ def assert_repeated(demonstrations, state, seed=0, alike=ALIKE):
     assert np.abs(found - motions(demonstrations, state)).max() < alike * extent(demonstrations)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("state", STATES)
 @pytest.mark.parametrize("task", ["draw_s", "draw_z", "push_box"])
 def test_motions_and_their_timing_do_not_hang_on_rounding_or_order(task, state):
@@ -88,12 +89,14 @@ EVEN = {
 for the side on which to pass."""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("state", STATES)
 @pytest.mark.parametrize("name", EVEN)
 def test_exactly_even_demonstrations_decide_nothing_by_rounding(name, state):
     assert_repeated(EVEN[name], state, alike=SADDLE if (name, state) == ("mirrored", "plain") else ALIKE)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["crossing at equal phase", "left and right from one start", "reach and retreat"])
 def test_the_state_and_the_labels_do_not_hang_on_rounding_or_order(name):
     assert_repeated(list(crossings()[name].demonstrations), "auto")

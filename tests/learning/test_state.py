@@ -58,6 +58,7 @@ def path_from_plain(imitation: Imitation, start):
     return imitation.transform.inverse(z)[0]
 
 
+@pytest.mark.long
 def test_a_field_of_places_is_learned_in_the_plain_state():
     shown, new = into_a_channel(7), into_a_channel(5, seed=1)
     chosen = learn(shown)
@@ -68,6 +69,7 @@ def test_a_field_of_places_is_learned_in_the_plain_state():
     assert plain < off(learn(shown, state="augmented"), new)
 
 
+@pytest.mark.long
 def test_what_a_hand_guides_is_learned_in_the_augmented_state_although_the_plain_one_draws_it():
     shown, new = of_a_hand(6), of_a_hand(20, seed=1)
     plain, chosen, motions = learn(shown, state="plain"), learn(shown), prepare(shown)
@@ -88,6 +90,7 @@ def test_what_crosses_is_learned_in_the_augmented_state_without_a_plain_fit_to_a
     assert plain.settings == []
 
 
+@pytest.mark.long
 def test_a_choice_that_has_seen_what_it_is_judged_by_is_another_one(monkeypatch):
     demonstrations = of_a_hand(6)
     assert learn(demonstrations).state == "augmented"
@@ -105,6 +108,7 @@ def test_what_both_would_have_given_is_said():
     assert learn(of_a_hand(6), state="augmented").choice is None
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("num", [1, 2])
 def test_of_one_or_two_none_is_left_out(num):
     chosen = learn(into_a_channel(num))
@@ -113,6 +117,7 @@ def test_of_one_or_two_none_is_left_out(num):
     assert crossing.state == "augmented" and "misses a demonstration" in crossing.reason
 
 
+@pytest.mark.long
 def test_a_plain_fit_that_misses_is_not_taken():
     demonstrations = into_a_channel(7)
     coarse = fit(demonstrations[:6])
@@ -130,6 +135,7 @@ def test_a_plain_fit_that_misses_is_not_taken():
     assert failing.state == "augmented" and "no map" in failing.reason
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "poor", [ImitationSettings(num_layers=1, regularisation=1.0), ImitationSettings(objective="velocity")]
 )
@@ -139,6 +145,7 @@ def test_settings_of_the_plain_fit_do_not_change_the_state(poor):
     assert fits.learned(tuple(of_a_hand(5)), poor).state == "augmented"
 
 
+@pytest.mark.long
 def test_order_and_what_is_shown_twice_do_not_change_the_choice():
     for demonstrations, state in ((into_a_channel(5), "plain"), (of_a_hand(5), "augmented")):
         assert learn(demonstrations[::-1]).state == state
@@ -146,6 +153,7 @@ def test_order_and_what_is_shown_twice_do_not_change_the_choice():
     assert twice.state == "plain"  # both are nearer than it matters
 
 
+@pytest.mark.long
 def test_progress_grows_and_ends_at_the_whole():
     for demonstrations in (into_a_channel(4), of_a_hand(4)):
         reports = []
@@ -174,6 +182,7 @@ def test_scatter_without_gaps_is_one_pattern_and_two_ways_are_two():
     assert learn([w for w in ways for _ in range(3)], state="augmented").known_labels == (-1.0, 1.0)
 
 
+@pytest.mark.long
 def test_the_settings_of_the_choice_are_what_they_say():
     demonstrations = into_a_channel(6)
     assert learn(demonstrations, choice=ChoiceSettings(alike=0.1)).state == "augmented"

@@ -143,6 +143,7 @@ def test_a_damaged_file_is_fitted_anew_said_and_replaced_by_a_whole_one(tmp_path
         assert len(counted) == 2
 
 
+@pytest.mark.long
 def test_no_flipped_byte_is_trusted_or_fatal(tmp_path, counted, learned, caplog):
     """Either the archive's checksums notice, or the byte meant nothing and the fit is the same."""
     FitStore(tmp_path).get(arcs(), SETTINGS)

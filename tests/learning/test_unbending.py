@@ -51,6 +51,7 @@ def same(one, other):
     return len(one) == len(other) and all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("turns", [2, 3])
 def test_what_winds_is_followed_on_a_map_that_does_not_fold(turns):
     demonstrations = helix(turns)
@@ -68,6 +69,7 @@ MANY = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("many", MANY)
 def test_shipped_demonstrations_and_drawings_are_unbent(many, monkeypatch):
     for demonstrations in MANY[many]():

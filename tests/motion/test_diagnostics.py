@@ -50,6 +50,7 @@ def kinds(frame):
     return {warning.kind for warning in frame.certificates.warnings}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("objective", ["trajectory", "velocity"])
 @pytest.mark.parametrize("misplaced", [False, True])
 def test_a_motion_through_the_obstacle_is_said_whatever_else_is(engine, middle, objective, misplaced):
@@ -166,6 +167,7 @@ def test_a_margin_that_the_meshes_do_not_keep_is_said_with_what_they_keep():
         assert margin_warnings(changed(scenario, **asks_for_none), nearest(0.001)) == ()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kept", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_the_last_frame_says_what_margin_the_meshes_keep(engine, fits, robot, initial, kept):
     if not kept:  # spheres that do not cover the arm

@@ -136,6 +136,7 @@ class TestReferencePosture:
         (part,) = avoidance.avoided.parts
         return load_jaco().collision.obstacle_distance(q, part)[0]
 
+    @pytest.mark.long
     def test_the_arm_rests_elsewhere_with_the_hand_where_it_was_and_can_be_taken_there(self, follower, beside, robot):
         nominal, avoidance = beside
         assert self.truth(follower.undisturbed(nominal).pins, avoidance).min() < 0  # so there is something to do

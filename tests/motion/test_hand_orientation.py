@@ -154,6 +154,7 @@ class TestLibrary:
         turned, wanted = arm.robot.hand_orientation(q[None]), motion.rollouts()[0].orientations
         assert wanted is not None and np.rad2deg(apart(turned, wanted[-1:])).max() < 2
 
+    @pytest.mark.long
     def test_a_task_is_placed_where_its_orientations_are_followed(self):
         arm, aside = dt.load_arm("jaco"), Rotation.from_euler("x", 120, degrees=True)
         takes = [replace(take, orientations=quaternions(aside * rotation(take.orientations))) for take in in_reach()]

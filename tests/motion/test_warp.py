@@ -93,6 +93,7 @@ def test_motions_bend_more_and_more_and_the_grid_with_them(engine):
     assert (np.diff(lines[:-1]) > 0).all()  # at last they leave the picture, and are cut shorter
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("space", ["task", "cspace"])
 def test_a_nearly_full_warp_is_nearly_the_stack_and_a_full_one_is_the_stack(engine, new_engine, space):
     scenario = stacked(engine, "push_box", space=space, view=View(field=False))

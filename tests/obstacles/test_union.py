@@ -1,6 +1,7 @@
 """Unions of obstacles beside the laws (tests/laws)."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -8,6 +9,7 @@ from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
 
 
+@pytest.mark.long
 @given(st.integers(0, 2**32 - 1), st.integers(2, 4))
 def test_it_is_moved_hardly_farther_than_to_the_nearest_place(seed, num):
     """Also where two spheres hardly overlap, and where leaving one leads deeper into the next."""

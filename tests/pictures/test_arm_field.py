@@ -73,6 +73,7 @@ def test_there_is_an_arrow_where_the_hand_moves_and_the_arm_reaches(scene):
     np.testing.assert_allclose(carried.velocities, velocities[[0, 4]], atol=1e-3)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("moves_goal", [False, True])
 @pytest.mark.parametrize("task", ["draw_s", "lift_box"])
 def test_velocities_are_those_of_the_whole_stack_whether_it_moves_a_place_or_not(engine, task, moves_goal):

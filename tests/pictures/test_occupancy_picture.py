@@ -45,6 +45,7 @@ def test_what_any_obstacle_is_believed_to_occupy_is_occupied():
     assert nothing.probability.max() == 0 and len(nothing.level) == len(nothing.outline) == 0
 
 
+@pytest.mark.long
 def test_the_points_beside_the_slice_are_shown_on_it_with_their_labels():
     own = np.random.default_rng(4).uniform(-0.1, 0.1, (20_000, 3))
     cloud = Cloud(own, (np.linalg.norm(own, axis=1) < 0.06).astype(float))

@@ -111,6 +111,7 @@ def test_where_the_spheres_clear_an_obstacle_the_meshes_clear_it_by_at_least_as_
     assert checked >= 10 and (found_out > checked / 4).all()
 
 
+@pytest.mark.long
 def test_links_keep_at_least_as_far_from_each_other_as_their_spheres_and_hardly_farther(body, robot):
     """By coal's distances of meshes."""
     model, paths = load_jaco().collision, random_configurations(robot, 1, (300, 1))

@@ -136,6 +136,7 @@ class TestShapes:
         assert found >= min(smallest, deepest) - 5e-3  # the points are that dense
         assert (found > 0) == (min(smallest, deepest) > 0)
 
+    @pytest.mark.long
     @pytest.mark.parametrize("kind", ["box", "mesh"])
     def test_shapes_within_a_link_and_around_the_hand(self, model, robot, kind):
         def cube(centre, size):
@@ -175,6 +176,7 @@ class TestBetweenSamples:
         assert found.distance <= at_home + TOLERANCE < -0.02
         assert 0.0 < found.at < 1.0
 
+    @pytest.mark.long
     @settings(max_examples=15)
     @given(seed=seeds, diameter=st.floats(0.02, 0.4), growth=st.floats(0.001, 0.2))
     def test_nothing_nearer_is_found_by_fine_sampling_and_what_is_found_is_there(self, seed, diameter, growth):

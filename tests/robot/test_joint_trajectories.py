@@ -121,6 +121,7 @@ class TestFollowed:
         assert motions[kind].times[-1] < held[kind].times[-1] < slowest * motions[kind].times[-1]
 
 
+@pytest.mark.long
 def test_the_file_names_the_joints_and_the_command_and_fits_it(held, arm):
     file = held["hand"]
     assert file.names == list(arm.joint_names)
@@ -172,6 +173,7 @@ def test_a_motion_that_no_arm_can_follow_has_no_trajectory(arm, change, said):
     assert "\n" not in str(raised.value)
 
 
+@pytest.mark.long
 def test_a_path_out_of_reach_has_no_trajectory(arm):
     path = dt.fit(dt.example("push_box"), state="plain").rollouts()[0]
     far = replace(path, positions=path.positions * np.linspace(1, 3, len(path.positions))[:, None])
@@ -186,6 +188,7 @@ def test_a_file_that_cannot_be_written_is_refused_in_one_line(arm, motions, tmp_
     assert "\n" not in str(raised.value) and not any(tmp_path.iterdir())
 
 
+@pytest.mark.long
 def test_it_can_be_slower_on_the_same_path(arm, motions):
     trajectory = arm.trajectory(motions["hand"])
     slower, t = trajectory.slower(1.5), np.linspace(0, trajectory.times[-1], 1000)

@@ -73,6 +73,7 @@ def beyond(robot: Robot, mesh) -> float:
     return float(away.min(axis=1).max())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["jaco", *OTHERS])
 def test_spheres_hold_the_links_and_stick_out_by_little(name):
     robot = load_arm(name)
@@ -131,6 +132,7 @@ def test_levers_are_those_of_the_hand_near_home(name):
     np.testing.assert_allclose(robot.levers, np.maximum(moved, 0.04 * robot.reach), rtol=0.1)
 
 
+@pytest.mark.long
 @each_arm
 def test_links_that_may_touch_are_few_and_the_others_are_apart_in_some_postures(name):
     robot = load_arm(name)
@@ -188,6 +190,7 @@ def test_the_jaco_in_the_cache_is_the_one_that_was_made(robot, monkeypatch):
         np.testing.assert_array_equal(kept[name], values, strict=True)
 
 
+@pytest.mark.long
 @each_arm
 def test_the_frame_is_the_urdfs_turned_about_the_vertical_and_the_hand_is_ahead_at_home(name):
     robot = load_arm(name)
@@ -235,6 +238,7 @@ def forget(monkeypatch, folder: Path) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(folder))
 
 
+@pytest.mark.long
 def test_an_arm_is_kept_and_found_again_and_made_anew_if_its_file_is_damaged(tmp_path, monkeypatch, caplog):
     forget(monkeypatch, tmp_path)
     path, made = write(tmp_path, urdf(4, shape=BALL)), []
@@ -341,6 +345,7 @@ def hollow(sides: int) -> LinkMesh:
     return LinkMesh("box", 0, np.array(joined.vertices), np.array(joined.faces))
 
 
+@pytest.mark.long
 def test_hollows_count_as_solid_unless_they_are_open_to_more_sides_than_one():
     closed, open_to_one, open_to_two = (cover(hollow(sides), CoverSettings()) for sides in range(3))
     for spheres in (closed, open_to_one):
@@ -354,12 +359,14 @@ def bounded(text, low, high):
     return text.replace('lower="-2" upper="2"', f'lower="{low}" upper="{high}"')
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("limits", [(0.5, 6.9), (0.0, 6.2832), (-7.0, -0.6), (-6.3, 6.3)])
 def test_home_is_within_limits_wherever_they_are(tmp_path, limits):
     robot = robot_from_urdf(write(tmp_path, bounded(urdf(5), *limits)))
     assert (robot.home >= limits[0]).all() and (robot.home <= limits[1]).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sizes", ["0.1 0.1 0", "0.1 0 0", "0.05 0.05 1e-9"])
 def test_flat_links_are_measured_like_others(tmp_path, sizes):
     plate = f'<geometry><box size="{sizes}"/></geometry>'
@@ -383,6 +390,7 @@ def test_states_of_other_groups_do_not_matter(tmp_path):
     assert semantic_homes(read_semantic(semantic), ["j0", "j1"]) == []
 
 
+@pytest.mark.long
 def test_a_material_that_has_changed_is_read_again(tmp_path):
     box = trimesh.creation.box((0.06, 0.06, 0.2))
     mesh, material = tmp_path / "box.obj", tmp_path / "box.mtl"

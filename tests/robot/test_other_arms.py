@@ -96,6 +96,7 @@ class TestKinematics:
 
 
 class TestAvoidance:
+    @pytest.mark.long
     def test_the_whole_arm_clears_a_ball_and_the_loop_takes_it_to_the_goal(self, arm, fits):
         engine = Engine(TASKS, fits, arm)
         task = engine.task("push_box")
@@ -124,6 +125,7 @@ class TestAvoidance:
             controller.step(np.zeros(6), 0.01)
 
 
+@pytest.mark.long
 def test_engines_of_two_arms_share_what_is_kept_and_none_gets_what_is_the_others(robot, fits):
     shared, found = Memo(), {}
     scenario = avoiding("push_box", Sphere((0.1, -0.5, 0.3), 0.1), space="cspace")
@@ -145,6 +147,7 @@ def around_a_ball(arm: Robot, size: float) -> tuple[dt.JointPath, ...]:
     return dt.Arm(arm).rollouts(around, spacing=0.005 * size)
 
 
+@pytest.mark.long
 def test_an_arm_of_half_the_size_moves_as_the_whole_one(robot):
     """All lengths in settings scale with the arm: in a world of half the size its joints do the same."""
     for whole, half in zip(around_a_ball(robot, 1.0), around_a_ball(shorter(robot, 0.5), 0.5), strict=True):

@@ -37,6 +37,7 @@ def assert_as_pinocchio_has_it(path, description, chain):
 HEAVY = {"so101", "z1"}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.slow) if name in HEAVY else name for name in ARMS]
 )

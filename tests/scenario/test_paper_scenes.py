@@ -31,6 +31,7 @@ def live(engine, at_rest):
     return lambda name: at_rest(SCENES[name].scenario(engine.task(SCENES[name].task)), Stage.LIVE)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", SHIPPED)
 def test_a_scene_is_shown_without_warnings(live, name):
     frame, scene = live(name), SCENES[name]
@@ -57,6 +58,7 @@ def test_certificates_of_a_scene_hold(engine, name):
     assert frame.arm is not None
 
 
+@pytest.mark.long
 def test_letters_of_the_lasa_data_are_a_scene_where_the_user_has_them_all(tmp_path, robot):
     """The files hold drawings that ship with DT-Viz, laid out as those of LASA, which may not be passed on."""
     scene, cells = SCENES["lasa"], np.empty((1, 7), dtype=object)

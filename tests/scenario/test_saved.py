@@ -524,6 +524,7 @@ def assert_refused_or_whole(text: str) -> bool:
     return True
 
 
+@pytest.mark.long
 def test_each_value_replaced_by_any_other_is_refused_or_makes_a_scenario():
     plain = json.loads(encode(rich()))
     paths = [path for path in leaves(plain) if path]

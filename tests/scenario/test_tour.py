@@ -67,6 +67,7 @@ def path_depth(frame, path):
     return -frame.scenario.obstacle.signed_distance(path).min()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("step", [ARM, ALL], ids=lambda step: step.title)
 def test_the_whole_arm_is_free_of_contact_and_every_check_holds(shown, step):
     frame = shown(step)
@@ -76,6 +77,7 @@ def test_the_whole_arm_is_free_of_contact_and_every_check_holds(shown, step):
     assert frame.certificates.warnings == () and not frame.blocked
 
 
+@pytest.mark.long
 def test_at_the_end_the_motion_passes_the_bias_point_beside_the_demonstrations(shown):
     frame = shown(ALL)
     ((_, point),) = anchored(frame.scenario).items()

@@ -89,6 +89,7 @@ async def visit(url, control, servers):
         assert not first.lost
 
 
+@pytest.mark.long
 def test_one_server_is_drained_and_one_is_killed(cache):
     assert HAPROXY is not None, "install it: apt-get install haproxy"
     with ExitStack() as stack:

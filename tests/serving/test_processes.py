@@ -91,6 +91,7 @@ async def lose_and_return(process, url):
         assert next(client for client in clients if client not in lost).has_picture
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="processes are looked up as Linux shows them")
 def test_visitors_of_two_processes_share_the_places_and_lose_nothing_else_with_one_of_them(cache):
     with started(cache, "--processes", "2", "--max-sessions", "2") as process:

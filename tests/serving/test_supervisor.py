@@ -101,6 +101,7 @@ def test_visitors_who_come_at_once_are_spread_evenly():
         assert sorted(visits.holders(20).values()) == [10, 10]
 
 
+@pytest.mark.long
 def test_who_comes_goes_where_the_fewest_are_whatever_was_requested_between():
     with serving() as (_, visits):
         busy = visits.asked(held=True)
@@ -112,6 +113,7 @@ def test_who_comes_goes_where_the_fewest_are_whatever_was_requested_between():
                 others.close()
 
 
+@pytest.mark.long
 def test_another_process_takes_the_place_of_one_that_is_killed_while_the_other_serves():
     with serving() as (process, visits):
         for _ in range(2):
@@ -130,6 +132,7 @@ def test_another_process_takes_the_place_of_one_that_is_killed_while_the_other_s
         assert process.stderr.read().count("another one takes its place") == 2
 
 
+@pytest.mark.long
 def test_a_process_that_does_not_answer_gets_nobody_and_is_replaced():
     with serving("", "4") as (_, visits):
         time.sleep(2 * RECENT)
@@ -157,6 +160,7 @@ def test_a_signal_while_a_process_is_forked_ends_all_in_time():
     assert (result.returncode, result.stdout, result.stderr) == (0, b"", b"")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["", "stubborn"])
 def test_a_signal_ends_all_in_time(kind):
     with serving(kind) as (process, visits):

@@ -278,6 +278,7 @@ class TestStore:
         assert follows(small, np.array([resampled(path, 40) for path in moved.paths]))
         assert not follows(small, np.array([resampled(path, 40) for path in kept.paths]))
 
+    @pytest.mark.long
     def test_an_own_task_is_as_it_was_opened_for_that_arm_and_in_reach_of_another(self, robot, fits):
         first, other = (Engine(TASKS, fits, arm) for arm in (robot, shorter(robot, 0.5)))
         engines = Engines(first, lambda _name, _progress: other)
@@ -350,6 +351,7 @@ def descriptions(tmp_path, monkeypatch):
 
 
 class TestMaking:
+    @pytest.mark.long
     def test_a_new_arm_is_made_in_another_process_and_then_loaded(self, descriptions, robot, fits, monkeypatch):
         titles = ArmStore(TASKS, fits, robot).titles
         assert titles["small"] == "small" and not {"away", "dog"} & set(titles)

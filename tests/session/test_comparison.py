@@ -59,6 +59,7 @@ def beside(new_engine, initial):
         return engine, scenario, list(engine.frames(scenario))
 
 
+@pytest.mark.long
 def test_quick_methods_follow_a_drag_and_slow_ones_come_one_after_the_other(beside):
     _, _, frames = beside
     assert [frame.stage for frame in frames[:4]] == list(Stage)
@@ -72,6 +73,7 @@ def test_quick_methods_follow_a_drag_and_slow_ones_come_one_after_the_other(besi
     assert told == sorted(told) and told[3] == 0 and set(told) == {0, 1, 2, 3}
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("quick")
 def test_while_slow_methods_are_planned_the_frames_say_which_and_how_many_are_left(new_engine, initial, monkeypatch):
     engine, first, second = new_engine(), "eflow-repulsive", SLOW
@@ -208,6 +210,7 @@ def test_of_a_single_demonstration_by_the_user_what_can_be_fitted_is_and_the_res
         assert f"{trained} has not been trained for 'Mine'" in found[name].note
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("quick")
 def test_interrupted_between_or_within_steps_it_goes_on_later(new_engine, initial):
     engine, scenario, frames = new_engine(), shown(initial("push_box"), LIVE, SLOW), []

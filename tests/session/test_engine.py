@@ -256,6 +256,7 @@ def test_a_motion_that_would_take_too_many_samples_says_so(new_engine, initial, 
     assert Kind.UNSAMPLED in kinds(frame.certificates.warnings)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("space", ["task", "cspace"])
 def test_wherever_refining_is_cancelled_it_leaves_nothing_half_done(fits, robot, space):
     (demonstration, *_), passed = TASKS["draw_s"]().demonstrations, []
@@ -340,6 +341,7 @@ def test_what_refines_ends_between_its_parts_when_it_is_not_wanted_any_more(new_
         next(frames)
 
 
+@pytest.mark.long
 def test_as_a_task_begins_it_is_computed_once_for_all_visitors_who_are_not_kept_by_it(fits, robot, initial):
     shared, last, ball = Memo(), Stage.CERTIFIED, initial("draw_s").obstacles[0]
     layers = biases(BiasPoint(as_point(np.add(ball.position, (0.1, 0.0, 0.1)))))

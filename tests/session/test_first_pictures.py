@@ -12,6 +12,7 @@ from dt_viz.session.frame import Stage
 from dt_viz.ui.visitor import initial_scenario
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "task", [pytest.param(name, marks=() if name == "draw_s" else pytest.mark.slow) for name in TASKS]
 )

@@ -288,6 +288,7 @@ async def test_who_waits_is_told_so_and_has_the_next_place_that_is_free(url, ser
         assert not waits(first) and waits(last) and len(server.visitors) == NUM_PLACES
 
 
+@pytest.mark.long
 @asynchronous
 async def test_who_does_nothing_gives_his_place_to_one_who_waits_and_only_then(url, server):
     async with AsyncExitStack() as stack:

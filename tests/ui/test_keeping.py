@@ -338,6 +338,7 @@ def test_two_pages_of_one_browser_keep_the_last_edit_and_complain_of_nothing(ope
     other.close()
 
 
+@pytest.mark.long
 def test_shapes_from_files_are_kept_and_come_back_beside_the_event_loop(opened_for):
     browser, box = Browser(), MeshObstacle(PLACE, Solid(*box_surface(np.full(3, 0.05))))
     page = opened_for(browser)

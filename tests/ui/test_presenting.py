@@ -266,6 +266,7 @@ async def test_who_comes_later_with_the_key_takes_over_and_who_leaves_is_missed(
         assert viewer.has_rollouts and stands_at(viewer, (0.1, -0.55, 0.4))
 
 
+@pytest.mark.long
 @asynchronous
 async def test_the_camera_follows_until_that_is_switched_off_and_again_from_then_on(url, server):
     async def sees(place, guest):

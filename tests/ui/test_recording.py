@@ -48,6 +48,7 @@ def test_it_is_titled_and_small(page, frame):
     assert f"<title>{frame.task.title} – DT-Viz</title>" in page.decode()
 
 
+@pytest.mark.long
 def test_the_largest_arm_leaves_room_for_a_scene(page):
     def size_of(robot):
         tape = Tape()

@@ -94,6 +94,7 @@ def test_a_motion_that_the_arm_does_not_follow_has_no_file_and_one_line_says_why
     assert {"none shown": "none that is shown", "blocked": "the goal is inside", "missed": text}[why] in said
 
 
+@pytest.mark.long
 def test_a_figure_is_saved_of_what_is_shown(saving, frame):
     shown(saving, frame)
     assert saving["Resolution"].visible
@@ -190,6 +191,7 @@ class TestFigure:
         assert b"<image" not in svg
         assert b"/Font" in render_figure(frame, ".pdf")
 
+    @pytest.mark.long
     def test_it_has_what_the_view_shows_in_the_pages_colours(self, at_rest, initial):
         scenario = initial("draw_s")
         view = replace(scenario.view, streamlines=True, colour="lyapunov", demonstrations=False, grid=True)

@@ -60,6 +60,7 @@ def test_it_is_a_step_of_the_session_and_shown(page):
     assert page.session.scenario.arm == "" and page["Model"].value == "JACO"
 
 
+@pytest.mark.long
 def test_joints_scenes_plots_and_the_loop_are_those_of_the_arm(page):
     visitor, scenes = page.visitor, page["Scene"].options
     assert num_joints(page) == 6 and set(scenes) >= OF_JACO
@@ -102,6 +103,7 @@ def test_push_reaches_the_arm_that_is_drawn(page):
     assert pushed == ["panda"] and np.array_equal(page.session.robot.home, taller().home)
 
 
+@pytest.mark.long
 def test_takes_that_are_open_are_read_again_for_another_arm(page):
     def done():
         for lane in (CHOOSING, LANE, SEEING):
@@ -123,6 +125,7 @@ def test_takes_that_are_open_are_read_again_for_another_arm(page):
     assert takes.visible and page.visitor.robot._aside and not page["Learn"].disabled
 
 
+@pytest.mark.long
 def test_takes_of_another_arm_that_are_open_cannot_be_learned_for_this_one(page):
     u = np.linspace(0, 1, 100)
     rows = np.column_stack([3 * u, page.session.robot.home + np.outer(u - 1, np.linspace(0.3, 0.1, 6))])

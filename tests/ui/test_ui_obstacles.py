@@ -214,6 +214,7 @@ def test_the_sizes_are_those_of_the_selected_obstacle(opened, selected, label, e
     assert hidden and all(item.change(changed, 7.0) == {} for item in hidden)
 
 
+@pytest.mark.long
 def test_a_file_that_is_uploaded_becomes_an_obstacle(opened):
     ball = trimesh.creation.icosphere(subdivisions=3, radius=40.0)  # millimetres
     cloud = trimesh.PointCloud(ball.vertices)
@@ -260,6 +261,7 @@ def test_what_is_too_large_is_not_even_looked_at(opened, suffix, monkeypatch):
     assert opened.said == [(f"huge.{suffix}: file: found 20.0 MB; accepted: at most 20 MB", Severity.ALARM)]
 
 
+@pytest.mark.long
 def test_a_file_in_another_unit_is_read_in_that_once_it_is_asked_for(opened):
     opened.files.load(stl(BALL_MESH.copy().apply_scale(1000)), "ball.stl", 1.0)
     question = "ball.stl seems to be in millimetres: 80 × 80 × 80 units. Read it in millimetres?"

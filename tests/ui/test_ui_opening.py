@@ -90,6 +90,7 @@ def _opened(server, robot, monkeypatch):
     server.scene.reset()
 
 
+@pytest.mark.long
 def test_what_is_opened_is_seen_in_place_of_the_motion_until_it_is_cancelled(opened):
     assert not opened.takes.visible
     opened.add("a.csv", csv())
@@ -107,6 +108,7 @@ def test_what_is_opened_is_seen_in_place_of_the_motion_until_it_is_cancelled(ope
     assert opened.page.session.scenario.task == "draw_s"
 
 
+@pytest.mark.long
 def test_switches_and_takes_are_chosen(opened):
     opened.add("b.zip", zipped(a=csv(), b=csv(jitter=0.002), c=csv(GOAL + np.array([-0.3, 0.0, 0.2]))))
     smooth = np.array(opened.takes.learned[1].node.points)
@@ -127,6 +129,7 @@ def test_switches_and_takes_are_chosen(opened):
     assert opened.num_drawn == 0 and opened["Learn"].disabled
 
 
+@pytest.mark.long
 def test_a_click_learns_what_is_seen_and_undo_goes_back(opened):
     opened.add("a.zip", zipped(a=csv(jitter=0.002), b=csv(), c=csv()))
     opened.choose("Smooth jitter", False)
@@ -152,6 +155,7 @@ def test_a_click_learns_what_is_seen_and_undo_goes_back(opened):
     assert session.scenario.task == task.name
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
@@ -177,6 +181,7 @@ def test_more_than_a_visitor_may_hold_is_refused(opened):
     assert opened.num_drawn == 1
 
 
+@pytest.mark.long
 def test_what_is_not_clear_is_asked_for_and_answered(opened):
     opened.add("mm.csv", csv(size=1000.0, timed=False).replace(b"x,y,z", b"a,b,c"))
     assert {"Unit", "Rate", "Column of x", "Column of t"} <= opened.labels()
@@ -194,6 +199,7 @@ def test_what_is_not_clear_is_asked_for_and_answered(opened):
     assert opened["Rate"].value == "100 Hz" and opened["Unit"].value == "mm"
 
 
+@pytest.mark.long
 def test_three_columns_without_names_can_be_told(opened):
     u = np.linspace(0, 1, 100)
     rows = np.column_stack([0.3 * u, -0.5 + 0.1 * np.sin(3 * u), 0.3 + 0.1 * u**2])  # the first is as even as times are
@@ -214,6 +220,7 @@ def test_several_goals_are_told_and_one_is_chosen(opened):
     assert opened.num_drawn == 2
 
 
+@pytest.mark.long
 def test_what_the_arm_cannot_reach_is_scaled_if_that_is_wanted(opened):
     opened.add("a.zip", zipped(a=csv(3 * GOAL), b=csv(3 * GOAL)))
     assert opened["Scale to fit"].value is False
@@ -222,6 +229,7 @@ def test_what_the_arm_cannot_reach_is_scaled_if_that_is_wanted(opened):
     assert opened["Scale to fit"].value is True
 
 
+@pytest.mark.long
 def test_forged_values_are_refused(opened):
     opened.add(
         "a.zip", zipped(a=csv(timed=False, size=1000.0, jitter=0.002), b=csv(GOAL + 0.2, timed=False, size=1000.0))
@@ -257,6 +265,7 @@ def test_after_cancel_the_next_file_is_the_only_one(opened):
     assert opened.takes.visible and opened.num_drawn == 1 and opened.takes.name.text == "b"
 
 
+@pytest.mark.long
 def test_the_folder_goes_again_with_a_first_file_that_cannot_be_read(opened):
     opened.add("a.csv", b"no numbers")
     assert len(opened.told) == 1 and opened.told[0].startswith("a: ")
@@ -355,12 +364,14 @@ def test_a_motion_that_is_not_read_is_one_line_and_changes_nothing(opened, tmp_p
         assert opened.page.session.scenario is before and opened.num_drawn == 1
 
 
+@pytest.mark.long
 def test_another_task_ends_what_is_open(opened):
     opened.add("a.csv", csv())
     opened.choose("Task", "Draw J")
     assert not opened.takes.visible and opened.page.session.scenario.task == "draw_j"
 
 
+@pytest.mark.long
 def test_two_visitors_open_at_the_same_instant_and_each_sees_its_own(robot, opened):
     beside = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     other = Page(beside, robot)

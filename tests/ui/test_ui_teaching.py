@@ -253,6 +253,7 @@ def test_the_hand_is_guided_over_several_drags_until_the_take_is_done(teaching):
     assert not teaching.grip.guides
 
 
+@pytest.mark.long
 def test_what_is_no_take_is_said_and_ignored(teaching):
     teaching.choose("Draw your own")
     teaching.draw([teaching.board.centre])
@@ -279,6 +280,7 @@ def test_a_drag_of_the_board_that_is_not_there_teaches_nothing(teaching):
     assert not teaching.takes.visible
 
 
+@pytest.mark.long
 def test_many_points_become_a_take(teaching):
     teaching.choose("Draw your own")
     fine = np.linspace(0, 39, 1500)

@@ -82,6 +82,7 @@ def test_what_no_page_has_kept_is_as_nothing(opened, forged):
     assert offers(page) and number(page) is None and not page.session.visits
 
 
+@pytest.mark.long
 def test_the_end_gives_back_all_as_it_was_to_the_byte_and_its_history(opened):
     page = opened(**{MADE_KEY: encode(Saved(MADE))})
     page.session.step("Warp", warp=0.5)
@@ -109,6 +110,7 @@ def test_the_end_gives_back_all_as_it_was_to_the_byte_and_its_history(opened):
     assert page.session.scenario == MADE
 
 
+@pytest.mark.long
 def test_undo_in_a_step_leads_no_farther_back_than_its_beginning(opened):
     page = opened()
     press(page, "New here?", TAKE)

@@ -170,6 +170,7 @@ def test_a_turntable_goes_around_the_middle_once(filming):
     as_before(filming, before)
 
 
+@pytest.mark.long
 def test_the_warp_goes_from_straight_motions_to_the_whole_stack(filming, frame, engine, robot, monkeypatch):
     before, drawn = state(filming), []
     draw = filming.visitor.pictures.draw
