@@ -51,7 +51,7 @@ def add_arm(
     )
     robot = {"visible": lambda s: not s.view.replay}
     label = lambda s: "Pause" if s.view.playing else "Play"  # noqa: E731
-    bindings.on(gui.add_button("Pause"), play_or_pause, label=label, **robot)
+    bindings.on(gui.add_button("Pause", hint="stops the robot, or lets it go on"), play_or_pause, label=label, **robot)
     bindings.slider(gui, "speed", **robot)
 
     def stands(scenario: Scenario) -> bool:

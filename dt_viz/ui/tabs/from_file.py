@@ -71,7 +71,7 @@ class FileLoader:
         self._refused: tuple[bytes, str, str] | None = None
         """Content and name of a file that was refused for its size, and the unit that would fit."""
         with gui.add_folder("From a file", expand_by_default=False):
-            self.unit = Control(gui.add_dropdown("Unit of the file", tuple(UNITS)))
+            self.unit = Control(gui.add_dropdown("Unit of the file", tuple(UNITS), hint="of its coordinates"))
             hint = f"{FORMATS}; a mesh must be closed; a csv of points has columns x, y, z and perhaps occupied"
             self._upload = gui.add_upload_button("Mesh or point cloud", icon=viser.Icon.UPLOAD, hint=hint)
             bindings.properties(self._upload, visible=has_room)

@@ -93,8 +93,10 @@ class OpenPanel:
         with self.folder:
             self.table = gui.add_html("")
             self.controls = self._add_controls(gui, send)
-            start = gui.add_button("Learn", color=LIGHT.brand, disabled=True)
-            cancel = gui.add_button("Cancel", color="gray")
+            start = gui.add_button(
+                "Learn", color=LIGHT.brand, disabled=True, hint="a motion from the takes that are used"
+            )
+            cancel = gui.add_button("Cancel", color="gray", hint="lets go of what is open here")
         self.controls["learn"] = self.control(start, lambda _pressed: self._press())
         self.control(cancel, lambda _pressed: self.close())
         bindings.show(lambda s: (s.task, s.scene), lambda _chosen: self.close(keeps=True))
@@ -122,7 +124,7 @@ class OpenPanel:
             found[name] = self.control(gui.add_dropdown(label, options, hint=hint, visible=False), act)
 
         dropdown("take", "Take", (NO_COLUMN,), self._point, "the take that is named in the scene")
-        box = gui.add_checkbox("Use this take", True, visible=False)
+        box = gui.add_checkbox("Use this take", True, visible=False, hint="learn from it, too")
         found["chosen"] = self.control(box, self._leave_out)
         button = gui.add_button("Delete this take", icon=viser.Icon.TRASH, color="gray", visible=False)
         found["delete"] = self.control(button, lambda _pressed: self._delete())

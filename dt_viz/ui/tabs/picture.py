@@ -78,7 +78,7 @@ class PictureTab:
         """
         self._tripod = tripod
         gui.add_html(ROW)
-        Control(gui.add_button_group("View", (*VIEWS, HAND, HOME)), tripod.view)
+        Control(gui.add_button_group("View", (*VIEWS, HAND, HOME), hint="where the camera looks from"), tripod.view)
 
         def box(label: str, hint: str) -> viser.GuiCheckboxHandle:
             return gui.add_checkbox(label, False, hint=hint)
@@ -91,7 +91,10 @@ class PictureTab:
         self._dark = bindings.later(dark, lambda _session, on: darken(on))
         big = box("Big type", "larger type and controls in a wider panel, to be read from afar")
         self._big = Control(big, enlarge)
-        on_press(gui.add_button("Presentation", icon=viser.Icon.PRESENTATION), lambda: presentation.show(True))
+        on_press(
+            gui.add_button("Presentation", icon=viser.Icon.PRESENTATION, hint="the scene and a caption alone"),
+            lambda: presentation.show(True),
+        )
         formats = PNG, *(suffix[1:].upper() for suffix in SUFFIXES), HTML, *VIDEOS
         hint = (
             "PNG: the scene as you see it; SVG, PDF: lines and text for a paper, seen from the plane of the task; HTML:"
@@ -103,8 +106,8 @@ class PictureTab:
             "ends it. Turntable: once around what is in the middle of the picture; warp: from 0 to 1"
         )
         self._what = Control(gui.add_dropdown("Video of", (MOTION, TURNTABLE, WARP), visible=False, hint=hint))
-        self._resolution = Control(gui.add_dropdown("Resolution", tuple(RESOLUTIONS)))
-        self._transparent = Control(gui.add_checkbox("Transparent", False))
+        self._resolution = Control(gui.add_dropdown("Resolution", tuple(RESOLUTIONS), hint="of the PNG, pixels"))
+        self._transparent = Control(gui.add_checkbox("Transparent", False, hint="the PNG has no background"))
 
         def make(session: Session, step: Step, cancelled: Cancelled) -> tuple[str, bytes]:
             if self._format.value == PNG:

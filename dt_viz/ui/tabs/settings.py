@@ -150,7 +150,7 @@ class _SettingField:
             lambda before, label: replace(before, method=methods[label]),
         )
         self.bind(
-            self.gui.add_slider("Steps", 1, MAX_STEPS, 1, 8, **given),
+            self.gui.add_slider("Steps", 1, MAX_STEPS, 1, 8, hint="of the flow, all of one length", **given),
             lambda integration: integration.steps,
             lambda before, steps: replace(before, steps=int(steps)),
             visible=lambda integration: integration.by_hand,

@@ -62,7 +62,7 @@ class ShowTab:
     def _add_slice(self, gui: viser.GuiApi, bindings: Bindings) -> None:
         """Add the controls of the slice, with a legend of its colours."""
         bindings.checkbox(gui, "move_slice")
-        self.back = gui.add_button("Back to the task's slice", visible=False)
+        self.back = gui.add_button("Back to the task's slice", visible=False, hint="where it was before it was moved")
         bindings.on(self.back, _put_back, visible=lambda s: s.view.slice is not None)
         names = {label: name for name, label in SLICE_COLOURS.items()}
         colour = gui.add_dropdown(OFFERS["colour"].label, tuple(names), hint=OFFERS["colour"].hint)
@@ -72,7 +72,7 @@ class ShowTab:
             "disabled": lambda s: not _shows_velocities(s),
         }
         bindings.slider(gui, "phase", **of_phase)
-        take = gui.add_button("Take the arm's phase", visible=False)
+        take = gui.add_button("Take the arm's phase", visible=False, hint="at which the arm is now")
         bindings.on(take, lambda session, _pressed: session.take_phase(), **of_phase)
         self.key = gui.add_html("", visible=False)
         bindings.show(self._legend_of, self._explain)

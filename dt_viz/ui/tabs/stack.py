@@ -199,7 +199,7 @@ def add_warp(gui: viser.GuiApi, bindings: Bindings, order: float | None = None) 
     """Build the slider of the warp and the button that plays it, from an order on; return both."""
     hint = "part of its time that each flow runs. 0: motions and space are straight; 1: the stack is complete"
     slider = gui.add_slider(WARP, 0.0, 1.0, 0.01, 1.0, order=order, hint=hint)
-    play = gui.add_button_group("Play warp", (PLAY,), order=None if order is None else order + 1)
+    play = gui.add_button_group("Play warp", (PLAY,), hint="from 0 to 1", order=None if order is None else order + 1)
     return bindings.field(slider, "warp"), bindings.plays(play, WARP, lambda _session, _button: grown)
 
 

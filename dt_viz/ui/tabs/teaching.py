@@ -41,7 +41,9 @@ class TeachPanel:
             first = opening.table.order - 1
             ways = gui.add_button_group("Teach", tuple(KINDS), hint="adds takes", order=first)
             self._told = gui.add_html("", order=first + 0.2)
-            self._done = gui.add_button("Take done", icon=viser.Icon.CHECK, visible=False, order=first + 0.5)
+            self._done = gui.add_button(
+                "Take done", icon=viser.Icon.CHECK, visible=False, hint="ends and keeps it", order=first + 0.5
+            )
         opening.control(begin, lambda _pressed: self._begin("draw"))
         opening.control(ways, lambda name: self._begin(KINDS[name]))
         opening.control(self._done, lambda _pressed: pen.finish())

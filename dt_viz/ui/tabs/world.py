@@ -203,7 +203,7 @@ def add_transforms(gui: viser.GuiApi, bindings: Bindings) -> None:
         buttons = gui.add_button_group("Change", ("Delete",), visible=False, hint="the selected transform")
         bindings.later(buttons, lambda session, _name: delete_transform(session), visible=lambda s: bool(added(s)))
         bindings.input(
-            gui.add_dropdown("Selected", (NO_TRANSFORM,), visible=False),
+            gui.add_dropdown("Selected", (NO_TRANSFORM,), visible=False, hint="what the controls below are of"),
             lambda s: selected(s) or NO_TRANSFORM,
             lambda s, value: {"view": replace(s.view, bias=value)},
             options=lambda s: tuple(added(s)) or (NO_TRANSFORM,),
