@@ -69,6 +69,7 @@ def test_programs_take_the_commands_of_the_documents(monkeypatch):
     assert len(TOLD) > 30 and len(RUN) > 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("command", RUN)
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of matplotlib's own parts
 @pytest.mark.usefixtures("fits")

@@ -56,6 +56,7 @@ def test_the_example_leads_motions_around_a_ball_and_the_arm_follows(push):
     assert joints.q.shape == (len(paths[0].times), 6) and joints.error.max() < 1e-3
 
 
+@pytest.mark.long
 def test_the_whole_arm_avoids_what_the_joints_are_told_to(push):
     arm, ball = dt.load_jaco(), dt.Sphere((0.0, -0.50, 0.22), diameter=0.12)
     around = push.stack(dt.Avoidance(ball, space="cspace"))

@@ -148,6 +148,7 @@ def test_a_saved_drawing_is_put_before_the_robot_with_its_obstacles(tmp_path, ne
     assert solved.stack.bundle.paths
 
 
+@pytest.mark.long
 def test_a_motion_that_the_page_has_not_is_refused_by_what_it_has_not(tmp_path):
     ball = dt.Sphere((-0.02, -0.31, 0.33), 0.08)
     dt.fit([*arcs(3)]).stack(dt.Avoidance(ball), dt.Avoidance(ball)).save(tmp_path / "a.npz")

@@ -94,6 +94,7 @@ def test_a_motion_is_read_back_to_the_last_bit(motions, name, tmp_path):
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
 
 
+@pytest.mark.long
 def test_all_kinds_of_transforms_and_obstacles_are_among_them(motions):
     stacked = [transform for motion in motions.values() for transform in motion.transforms]
     assert {type(transform) for transform in stacked} == set(registry.KINDS)
@@ -403,6 +404,7 @@ def test_other_files_are_refused(saved, tmp_path):
             dt.Motion.load(path)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("num", [60, pytest.param(3000, marks=pytest.mark.slow)])
 def test_mutated_files_are_read_or_refused(saved, num):
     """Some are read, and most are not."""

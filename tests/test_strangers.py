@@ -192,6 +192,7 @@ def test_changes_are_warned_about_and_reported_take_by_take(tmp_path):
     assert again.report() == motion.report()
 
 
+@pytest.mark.long
 def test_clean_takes_are_learned_without_a_warning():
     takes = dt.example("draw_j")
     with warnings.catch_warnings():

@@ -88,6 +88,7 @@ def test_more_visitors_of_a_process_are_answered_later_until_it_has_no_time_at_a
 # --- latency, drag, scenes ---
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("dragged", ["obstacle", pytest.param("bias --obstacles 0", marks=pytest.mark.slow)])
 def test_latency_counts_every_edit_and_reports_both_stages(measured, dragged, monkeypatch):
     recorder, frames = Recorder(), Engine.frames

@@ -300,6 +300,7 @@ BOMBS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("text", BOMBS.values(), ids=BOMBS)
 def test_a_bomb_for_a_scenario_is_refused_at_once_in_little_memory(text, program):
     assert len(text) <= 3 * MAX_BYTES

@@ -146,6 +146,7 @@ def test_the_first_line_of_an_answer_may_be_as_long_as_very_many_takes_make_it(r
     assert read_upload(Triangles, [("a.stl", BOX)]).notes == ("x" * 10**7,)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("begins", "words"), [(False, "reader: found none that is ready"), (True, "file: found data that take more than")]
 )

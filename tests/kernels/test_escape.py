@@ -99,6 +99,7 @@ def test_too_many_steps_are_an_error(field, postures):
         carried(field, postures, None, DORMAND_PRINCE, -0.7, 2, 1e-9)
 
 
+@pytest.mark.long
 def test_no_postures_and_other_layouts_of_memory(field, postures):
     assert field(np.empty((0, 6))).shape == field.carried(np.empty((0, 6)), RK4, 1.0, 2).shape == (0, 6)
     assert ARM.clearance(np.empty((0, 6)), Union(field.obstacles)).shape == (0,)

@@ -57,6 +57,7 @@ def assert_no_steeper(obstacle, points):
         assert (change <= steepest(obstacle) * np.linalg.norm(moved - points, axis=1) + 1e-12).all()
 
 
+@pytest.mark.long
 def test_the_distance_changes_no_faster_than_the_point_moves(obstacle):
     assert_no_steeper(obstacle, around(obstacle, 600))
 
@@ -73,6 +74,7 @@ def test_inside_is_where_the_drawn_surface_has_it_and_the_surface_lies_on_the_su
     assert np.abs(obstacle.signed_distance(on_it)).max() < 1.5e-3
 
 
+@pytest.mark.long
 def test_distances_are_those_of_trimesh(obstacle):
     points = around(obstacle, 120, 1.5)
     expected = -trimesh.proximity.signed_distance(drawn(obstacle), points)
@@ -105,6 +107,7 @@ def test_a_distance_does_not_depend_on_how_many_are_asked_for(obstacle):
         np.testing.assert_allclose(obstacle.signed_distance(points[k : k + 1]), together[k : k + 1], rtol=0, atol=1e-12)
 
 
+@pytest.mark.long
 def test_the_nearest_free_place_is_free_and_near(obstacle):
     inside = within(obstacle, 200)
     moved = Union((obstacle,)).nearest_free(inside)
@@ -157,6 +160,7 @@ def test_every_point_inside_leaves_along_the_reverse_flow(obstacle, temperature)
     assert obstacle.signed_distance(ends).min() > 0
 
 
+@pytest.mark.long
 def test_a_motion_through_it_is_cleared(obstacle):
     along = np.array([0.6, 0.64, 0.48])
     path = np.asarray(obstacle.position) + np.array([1e-3, 2e-3, 1e-3]) + np.linspace(-0.4, 0.4, 401)[:, None] * along

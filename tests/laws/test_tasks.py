@@ -84,6 +84,7 @@ def test_the_obstacle_first_stands_in_the_way_of_the_motion(name, task, initial)
     assert clearance < scenario.avoidance.margin
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("space", SPACES)
 def test_hand_and_arm_find_a_way_to_the_goal_around_the_obstacle_where_it_first_stands(name, space, at_rest, initial):
     frame = at_rest(changed(initial(name), space=space), Stage.LIVE)

@@ -94,6 +94,7 @@ def test_in_a_plane_nothing_leaves_it(transform, built):
     assert np.abs(moved @ normal).max() < 1e-12
 
 
+@pytest.mark.long
 def test_the_system_with_it_is_conjugate_to_the_one_without_and_its_motions_are_those_of_its_velocity(transform, built):
     psi = Chain([below().transform, built(transform).transform])
     system = DiffeomorphicSystem(psi, replace(below().base, goal=psi.forward(built(transform).goal)))

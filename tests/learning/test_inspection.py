@@ -207,6 +207,7 @@ GRID = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("task", "rate", "names", "state"),
     [

@@ -74,6 +74,7 @@ def _in_this_process(monkeypatch):
 
 
 class TestMeshes:
+    @pytest.mark.long
     @pytest.mark.parametrize("kind", [*FORMATS, "stl_ascii"])
     def test_every_format_gives_the_same_solid(self, kind):
         solid, notes = read_mesh(exported(BOX, kind), f"crate.{kind[:3].upper()}")
@@ -83,6 +84,7 @@ class TestMeshes:
         obstacle = MeshObstacle((0.3, 0.0, 0.0), solid)
         np.testing.assert_allclose(obstacle.signed_distance(np.array([0.3, 0.0, 0.2])), 0.175, atol=2e-3)
 
+    @pytest.mark.long
     def test_parts_of_a_scene_are_placed(self):
         scene = trimesh.Scene()
         for x in (-0.1, 0.1):
@@ -102,6 +104,7 @@ class TestMeshes:
         assert "0.0015 × 0.001 × 0.0005 m" in refusal(read_mesh, content, "small.stl", scale=1e-5)
         assert "scale" in refusal(read_mesh, content, "a.stl", scale=0.0)
 
+    @pytest.mark.long
     def test_a_small_hole_is_filled_and_said(self):
         ball = trimesh.creation.icosphere(3, 0.07)
         holed = trimesh.Trimesh(ball.vertices, ball.faces[1:], process=False)
@@ -116,6 +119,7 @@ class TestMeshes:
         assert len(solid.vertices) == 8
         assert trimesh.Trimesh(solid.vertices, solid.faces).volume > 0
 
+    @pytest.mark.long
     def test_an_open_and_a_flat_mesh_are_refused(self):
         half = trimesh.creation.icosphere(3, 0.07).slice_plane([0, 0, 0], [0, 0, 1])
         several = trimesh.Trimesh(half.vertices, half.faces[::2], process=False)
@@ -123,6 +127,7 @@ class TestMeshes:
         flat = trimesh.creation.box((0.1, 0.1, 1e-9))
         assert re.search("volume|thickness|edges", refusal(read_mesh, exported(flat, "ply"), "flat.ply"))
 
+    @pytest.mark.long
     def test_a_thin_wall_is_said(self):
         wall, post = trimesh.creation.box((0.3, 0.3, 0.004)), trimesh.creation.box((0.05, 0.05, 0.1))
         post.apply_translation([0.2, 0.0, 0.0])
@@ -162,6 +167,7 @@ class TestMeshes:
         glb = b"glTF" + struct.pack("<III", 2, 20 + len(body), len(body)) + b"JSON" + body
         assert "faces: found none" in refusal(read_mesh, glb, "a.glb")
 
+    @pytest.mark.long
     def test_many_faces_are_ready_soon(self):
         content = exported(trimesh.creation.icosphere(6, 0.07), "stl")
         start = time.thread_time()  # of the processor: what else it has to do counts not

@@ -67,6 +67,7 @@ def test_the_warped_grid_of_the_identity_is_the_grid(engine, scenario, wanted):
     assert frame.pictures.generator is None  # nothing is learned that could be shown
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("wanted", [Stage.LIVE, Stage.FINE])
 def test_the_warped_grid_is_made_of_images_of_points_of_planes(engine, scenario, wanted):
     """ψ by another way, the forward side of the whole stack, leads back to the lattice, seen along the normal."""

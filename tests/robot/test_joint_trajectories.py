@@ -116,6 +116,7 @@ class TestFollowed:
             before = near
         np.testing.assert_allclose(file.q[[0, -1]], joints.q[[0, -1]], atol=1e-9)
 
+    @pytest.mark.long
     def test_it_is_nowhere_ahead_of_the_motion_and_not_much_later(self, kind, held, motions):
         slowest = {"hurried": 5.0}.get(kind, 1.2)
         assert motions[kind].times[-1] < held[kind].times[-1] < slowest * motions[kind].times[-1]

@@ -311,6 +311,7 @@ def test_states_of_an_srdf_are_homes_where_they_name_all_joints(tmp_path):
     assert semantic_homes(panda, ["panda_joint1", "another"]) == []
 
 
+@pytest.mark.long
 def test_a_given_front_and_home_are_taken(tmp_path, monkeypatch):
     forget(monkeypatch, tmp_path)
     path, home = write(tmp_path, urdf(4, shape=BALL)), (0.2, 0.6, -0.4, 0.3)
@@ -375,6 +376,7 @@ def test_flat_links_are_measured_like_others(tmp_path, sizes):
     assert np.isfinite(robot.collision.nearest_to_table(robot.home[None]).distance)
 
 
+@pytest.mark.long
 def test_what_is_not_drawn_is_shown_by_what_collides(tmp_path):
     robot = robot_from_urdf(write(tmp_path, urdf(4)))  # its boxes are for collisions alone
     assert [mesh.name for mesh in robot.visuals] == [mesh.name for mesh in robot.meshes]
@@ -439,6 +441,7 @@ def test_what_is_fixed_to_the_base_is_turned_along(name):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("frame", ["base", "page"])
 @each_arm
 def test_files_of_angles_and_of_places_in_the_base_frame_agree(tmp_path, name, frame):

@@ -143,6 +143,7 @@ def test_motions_of_a_flat_figure_give_way_in_its_plane(live, name):
         assert np.abs(height).max() <= np.abs(usual).max() + 1e-4
 
 
+@pytest.mark.long
 def test_panels_show_each_step_from_the_base_attractor(live):
     titles = {name: [panel.title for panel in live(name).pictures.panels] for name in SHIPPED}
     assert titles["steps"] == ["base attractor", "imitation", "+ avoidance"]

@@ -337,6 +337,7 @@ def test_more_takes_than_a_page_teaches_are_refused():
         decode(encode(Saved(Scenario("draw_s"), lesson=lesson(MAX_TAKES))), KNOWN)
 
 
+@pytest.mark.long
 def test_an_open_mesh_is_refused_and_a_closed_one_is_not():
     for faces, refused in ((FROM_FILE.faces, False), (FROM_FILE.faces[:5], True)):
         mesh = MeshObstacle(PLACE, Solid(FROM_FILE.vertices, faces))

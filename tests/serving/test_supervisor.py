@@ -96,6 +96,7 @@ def is_alive(pid):
     return False
 
 
+@pytest.mark.long
 def test_visitors_who_come_at_once_are_spread_evenly():
     with serving() as (_, visits):
         assert sorted(visits.holders(20).values()) == [10, 10]
@@ -174,6 +175,7 @@ def test_a_signal_ends_all_in_time(kind):
         assert visits.all_ended()
 
 
+@pytest.mark.long
 def test_no_process_outlives_the_one_that_accepts():
     with serving() as (process, visits):
         pids = visits.both()

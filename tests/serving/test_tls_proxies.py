@@ -146,6 +146,7 @@ class Telling(BaseHTTPRequestHandler):
         pass
 
 
+@pytest.mark.long
 def test_nobody_gets_in_without_the_password_or_under_another_address(behind, certificate):
     run, port = behind
     with ThreadingHTTPServer(("127.0.0.1", 0), Telling) as telling:
@@ -161,6 +162,7 @@ def test_nobody_gets_in_without_the_password_or_under_another_address(behind, ce
             telling.shutdown()
 
 
+@pytest.mark.long
 def test_a_visitor_drags_behind_it(behind, certificate, cache, monkeypatch):
     run, port = behind
     monkeypatch.setenv("SSL_CERT_FILE", str(certificate[0]))

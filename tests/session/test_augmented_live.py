@@ -167,6 +167,7 @@ def with_ways(new_engine):
     return engine
 
 
+@pytest.mark.long
 def test_an_added_start_takes_the_way_of_its_label_and_that_of_the_nearest_without(new_engine):
     engine = with_ways(new_engine)
     task = engine.task("ways")
@@ -285,6 +286,7 @@ def test_pictures_are_of_the_phase_that_is_asked_for(engine):
     assert np.abs(one - other).max() > 0.02
 
 
+@pytest.mark.long
 def test_the_scene_shows_both_states_side_by_side(engine):
     scene = SCENES["augmented"]
     frame = last(engine, scene.scenario(engine.task(scene.task)))
@@ -398,6 +400,7 @@ def test_the_arm_in_the_loop_draws_the_pattern_of_its_label():
         dt.Controller(motion, arm, 3.0)
 
 
+@pytest.mark.long
 def test_velocities_and_phase_are_what_rollouts_are_made_of():
     case = CASES["wide eight"]
     motion = dt.fit(case.demonstrations)

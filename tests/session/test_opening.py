@@ -52,6 +52,7 @@ def six(goal_of_last=GOAL):
     return Recordings(tuple(take(f"take {k}", path) for k, path in enumerate(paths)))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_saved_drawing_is_put_where_the_arm_follows_it_and_a_motion_in_space_stays(robot, tmp_path, dim):
     paths = [motion(np.array([-0.2, -0.4, 0.2 + 0.01 * k]))[:, :dim] for k in range(3)]

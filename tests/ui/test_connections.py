@@ -497,6 +497,7 @@ async def test_forged_values_change_nothing_and_break_nothing(url, server):
         np.testing.assert_array_equal(visitor.client.camera.position, camera)
 
 
+@pytest.mark.long
 @asynchronous
 async def test_a_flood_is_slowed_down(url, server):
     async with visiting(url) as client:
@@ -507,6 +508,7 @@ async def test_a_flood_is_slowed_down(url, server):
         assert monotonic() - began > 1  # the second that it began in may have been over at once
 
 
+@pytest.mark.long
 @asynchronous
 async def test_what_callbacks_raise_is_in_the_log_without_what_was_sent(url, caplog, capfd):
     def of_the_gate():
@@ -551,6 +553,7 @@ def uploads_of(visitor):
     return visitor.client.gui._current_file_upload_states
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("content", "announced", "said"),
     [

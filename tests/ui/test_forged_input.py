@@ -115,6 +115,7 @@ def test_nothing_that_a_page_sends_passes_by_the_border(page):
         assert inspect.iscoroutinefunction(callback), f"{name} would wait in the pool that all visitors share"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("claim", CLAIMS, ids=lambda claim: repr(claim)[:20])
 def test_a_forged_value_is_refused_or_moved_to_the_limits(page, claim):
     seen = []

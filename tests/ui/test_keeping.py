@@ -104,6 +104,7 @@ def made(camera: Any = None, scenario: Scenario = MADE) -> str:
     return encode(Saved(scenario, camera))
 
 
+@pytest.mark.long
 def test_each_edit_is_kept_and_the_next_page_begins_with_it(opened_for):
     browser = Browser()
     page = opened_for(browser)
@@ -129,6 +130,7 @@ def test_the_line_of_status_says_so_until_the_next_edit(opened_for):
     assert "restored" not in verdict(replace(progress, restored=None)).line
 
 
+@pytest.mark.long
 def test_the_newest_is_kept_at_most_twice_a_second(opened_for, monkeypatch):
     browser = Browser()
     page = opened_for(browser)
@@ -167,6 +169,7 @@ def test_a_visitor_who_leaves_is_not_waited_for(opened_for, monkeypatch):
     assert page.session.jobs.wait_idle(LANE, PATIENCE)
 
 
+@pytest.mark.long
 def test_a_reset_begins_anew_also_in_the_next_page(opened_for):
     browser = Browser(**{KEY: made()})
     page = opened_for(browser)
@@ -293,6 +296,7 @@ def test_a_browser_that_never_tells_is_given_up_and_told_of_edits_only(opened_fo
     assert kept(browser).scenario.warp == 0.5
 
 
+@pytest.mark.long
 def test_what_a_slow_browser_tells_while_a_task_is_chosen_or_after_a_reset_is_not_taken(opened_for):
     browser, chosen = Slow(**{KEY: made()}), threading.Event()
     page = opened_for(browser)
@@ -327,6 +331,7 @@ def test_what_a_slow_browser_tells_after_an_edit_is_not_taken(opened_for):
     assert page.session.scenario == mine and kept(browser).scenario == mine
 
 
+@pytest.mark.long
 def test_two_pages_of_one_browser_keep_the_last_edit_and_complain_of_nothing(opened_for, robot, another):
     browser = Browser()
     one, other = opened_for(browser), Page(another, robot, kept=browser)
@@ -436,6 +441,7 @@ def kept_takes(browser: Any) -> tuple[str, ...]:
     return () if lesson is None else tuple(take.name for take in lesson.takes)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scenario", [None, MADE], ids=["as the page begins", "edited"])
 def test_takes_that_are_not_learned_are_kept_and_open_in_the_next_page(opened_for, scenario):
     browser = Browser()
@@ -460,6 +466,7 @@ def test_takes_that_are_not_learned_are_kept_and_open_in_the_next_page(opened_fo
     assert kept_takes(again.client.local_storage) == () and '"version":2' in again.client.local_storage[KEY]
 
 
+@pytest.mark.long
 def test_takes_that_are_learned_are_kept_with_their_task_and_put_back_in_the_next_page(opened_for):
     browser = Browser()
     page = opened_for(browser)
@@ -477,6 +484,7 @@ def test_takes_that_are_learned_are_kept_with_their_task_and_put_back_in_the_nex
     assert open_takes(again) == ("1 · drawn 1", "2 · drawn 2", "3 · drawn 3")
 
 
+@pytest.mark.long
 def test_takes_wait_where_another_task_is_chosen_and_are_still_kept(opened_for):
     browser = Browser()
     page = opened_for(browser)
@@ -489,6 +497,7 @@ def test_takes_wait_where_another_task_is_chosen_and_are_still_kept(opened_for):
     assert len(open_takes(page)) == 3
 
 
+@pytest.mark.long
 def test_a_file_has_the_takes_too_and_those_that_were_open_come_back_by_undo(opened_for, monkeypatch):
     page = opened_for(Browser())
     teach(page, 3)
@@ -519,6 +528,7 @@ def test_takes_that_are_too_long_are_said_once_and_all_else_is_kept(opened_for, 
     assert said == [keeping.OWN_TAKES] and kept(browser) == Saved(MADE)
 
 
+@pytest.mark.long
 def test_takes_of_a_slow_browser_are_opened_unless_something_is_taught_before(opened_for):
     first = opened_for(Browser())
     teach(first)
@@ -629,6 +639,7 @@ def assert_is_at(camera: Any, pose: Any) -> None:
     np.testing.assert_allclose(camera, pose)
 
 
+@pytest.mark.long
 def test_a_camera_that_is_moved_is_kept_and_one_that_is_not_is_none(opened_for):
     browser = Browser()
     page = opened_for(browser)

@@ -160,6 +160,7 @@ async def test_before_anybody_presents_viewers_are_told_so(fits):
             assert early.says(NOT_YET) and not early.has_picture
 
 
+@pytest.mark.long
 @asynchronous
 async def test_viewers_see_what_the_presenter_draws_early_or_late(url, server):
     async with watching(url) as early, presenting_at(url) as presenter:
@@ -232,6 +233,7 @@ async def test_a_wrong_key_is_told_so_and_changes_nothing(url, server):
         assert len(server.visitors) == 1 and not presenter.lost and not viewer.says("Show address")
 
 
+@pytest.mark.long
 @asynchronous
 async def test_who_comes_later_with_the_key_takes_over_and_who_leaves_is_missed(url, server):
     async with watching(url) as viewer:

@@ -210,6 +210,7 @@ def test_three_columns_without_names_can_be_told(opened):
     assert opened["Rate"].value == "20 Hz"
 
 
+@pytest.mark.long
 def test_several_goals_are_told_and_one_is_chosen(opened):
     far = GOAL + np.array([0.0, 0.1, 0.3])
     opened.add("a.zip", zipped(a=csv(), b=csv(far), c=csv(), d=csv(far)))
@@ -304,6 +305,7 @@ def content_of(motion, folder):
     return (folder / "my_motion.npz").read_bytes()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", MOTIONS)
 def test_a_saved_motion_is_the_same_on_the_page(opened, tmp_path, new_engine, name):
     motion = MOTIONS[name]()
@@ -319,6 +321,7 @@ def test_a_saved_motion_is_the_same_on_the_page(opened, tmp_path, new_engine, na
     assert session.scenario.task == "draw_s"
 
 
+@pytest.mark.long
 def test_a_saved_drawing_is_on_the_board_with_its_obstacles_and_without_any_it_has_the_sphere(opened, tmp_path):
     box = dt.Box((0.0, -0.3, 0.0), (0.05, 0.1, 0.08))
     plain = dt.fit([*arcs(2)], settings=QUICK, state="plain")
@@ -342,6 +345,7 @@ def refused_motions():
     yield SavedMotion((far,), (), augmented=True), "positions of 'far': found 1000 m"
 
 
+@pytest.mark.long
 def test_a_motion_that_is_not_read_is_one_line_and_changes_nothing(opened, tmp_path):
     opened.add("good.csv", csv())
     before, good = opened.page.session.scenario, content_of(MOTIONS["in space"](), tmp_path)

@@ -145,6 +145,7 @@ def test_after_a_reload_the_same_step_is_shown_and_the_end_gives_back_what_was_m
     assert decode(page.client.local_storage[MADE_KEY], Known(tuple(TITLES))).scenario == MADE
 
 
+@pytest.mark.long
 def test_it_begins_once_a_slow_browser_has_told_what_was_made(opened_for):
     """Otherwise the step would be taken for an edit, and what was made be lost."""
     told = threading.Event()

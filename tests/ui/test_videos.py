@@ -223,6 +223,7 @@ def test_an_edit_ends_it_and_is_shown(filming, frame):
     assert filming.session.scenario.warp == 0.5 and filming.visitor.robot.playback.film is None
 
 
+@pytest.mark.long
 def test_what_moves_waits_and_the_theme_that_is_chosen_comes_afterwards(filming, monkeypatch):
     visitor, browser = filming.visitor, filming.browser
     visitor.robot.playback.replay.play()
