@@ -35,16 +35,21 @@ class Archive:
     """Texts; arrays of several are left out."""
 
 
-def arrays_of(content: bytes | Path, *, max_bytes: int, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
+def arrays_of(
+    content: bytes | Path, *, max_bytes: int, max_arrays: int | None = None, names: Collection[str] | None = None
+) -> dict[str, np.ndarray]:
     """Read the arrays of an npz archive, its bytes or its path: some by their names, None reads all.
 
     Raises:
-        FormatError: it unpacks to more than `max_bytes`, as its directory says.
+        FormatError: it unpacks to more than `max_bytes`, or has more than `max_arrays`, as its directory says.
         Exception: of almost any kind, if it is no archive, damaged, or holds pickled objects.
     """
     file = io.BytesIO(content) if isinstance(content, bytes) else content
     with zipfile.ZipFile(file) as archive:
-        size = sum(member.file_size for member in archive.infolist())
+        members = archive.infolist()
+    size = sum(member.file_size for member in members)
+    if max_arrays is not None:
+        check_at_most("arrays", len(members), max_arrays)
     if size > max_bytes:
         raise FormatError("file", f"{size} bytes when unpacked", f"at most {max_bytes} bytes")
     if names is not None and not names:
@@ -73,8 +78,7 @@ def read_archive(files: Sequence[tuple[str, bytes]], max_bytes: int, max_text: i
         Exception: as `arrays_of`.
     """
     ((_name, content),) = files
-    arrays = arrays_of(content, max_bytes=max_bytes)
-    check_at_most("arrays", len(arrays), MAX_ARRAYS)
+    arrays = arrays_of(content, max_bytes=max_bytes, max_arrays=MAX_ARRAYS)
     texts = {name: str(array) for name, array in arrays.items() if array.dtype.kind == "U" and not array.ndim}
     for name, text in texts.items():
         check_at_most(f"array {name[:40]!r}", len(text), max_text, "characters")
