@@ -36,6 +36,7 @@ from dt_viz.learning.inspection import Inspection, PreparationSettings
 from dt_viz.learning.interface import AnyImitation
 from dt_viz.learning.patterns import AugmentedSettings
 from dt_viz.learning.preparation import ImitationError
+from dt_viz.obstacles.files import measured_apart
 from dt_viz.obstacles.shapes import SHAPES, Obstacle
 from dt_viz.scenario.own import Own
 from dt_viz.scenario.relocation import in_world
@@ -177,8 +178,8 @@ def motion_task(path: Path) -> Task:
 def sent_motion_task(name: str, content: bytes, cancelled: Cancelled) -> Task:
     """Return a motion that a visitor has sent, the name and the content of its file, as a task of the page.
 
-    The archive is unpacked in another process. A motion in the augmented state is learned again in the time that
-    demonstrations take, as it has the settings that these are learned with.
+    The archive is unpacked, and its shapes are measured, in another process. A motion in the augmented state is learned
+    again in the time that demonstrations take, as it has the settings that these are learned with.
 
     Raises:
         DataError: as `motion_task`, or it was learned with other settings.
@@ -188,7 +189,8 @@ def sent_motion_task(name: str, content: bytes, cancelled: Cancelled) -> Task:
         sent = read_upload(Archive, [(name, content)], cancelled, max_bytes=MAX_BYTES, max_text=MAX_PLAIN)
         texts = {key: np.array(text) for key, text in sent.texts.items() if key == TEXT}
         read = _read({**texts, **sent.numbers, **sent.integers}, name, as_usual=True)
-    return _task_of(*read, Path(name))
+    with measured_apart(cancelled):
+        return _task_of(*read, Path(name))
 
 
 def _task_of(saved: SavedMotion, imitation: AnyImitation, path: Path) -> Task:

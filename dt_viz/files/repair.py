@@ -1,6 +1,6 @@
 """Repair of damaged meshes: coinciding vertices, triangles that are turned, and small holes.
 
-What stays open is for the votes of winding numbers (`dt_viz.obstacles.triangles.inside_of_grid`).
+What stays open is for the votes of winding numbers (`dt_viz.files.triangles.inside_of_grid`).
 """
 
 from __future__ import annotations

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from dt_viz.errors import FormatError
+from dt_viz.files.grids import Distances, read_distances
 from dt_viz.files.npz import Archive, read_archive
 from dt_viz.files.processes import stand_back
 from dt_viz.files.recordings import Recordings, read_recordings
@@ -39,6 +40,7 @@ READERS: Mapping[str, Callable[..., Any]] = {
     Points.__name__: read_points,
     Recordings.__name__: read_recordings,
     Archive.__name__: read_archive,
+    Distances.__name__: read_distances,
 }
 """Readers of names and contents, by the class of what they give."""
 
@@ -72,9 +74,8 @@ def answer(kind: str, files: list[tuple[str, bytes]], **options: Any) -> tuple[d
         return {"refused": ["file", f"data that need more than {MEMORY / 1e9:.0f} GB to read", "a smaller file"]}, []
     except Exception as error:  # no reader lists what corrupt bytes make it raise
         reason = " ".join(str(error).split())[:200] or type(error).__name__
-        return {
-            "refused": ["file", f"something that cannot be read ({reason})", f"a {Path(files[0][0]).suffix} file"]
-        }, []
+        accepted = f"a {Path(files[0][0]).suffix or 'whole'} file"
+        return {"refused": ["file", f"something that cannot be read ({reason})", accepted]}, []
     return {"value": value, "arrays": [*arrays]}, [*arrays.values()]
 
 

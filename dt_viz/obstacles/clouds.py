@@ -11,10 +11,10 @@ from scipy.spatial import KDTree
 
 from dt_viz.errors import FormatError
 from dt_viz.files.checks import check_at_least, check_at_most, check_finite
+from dt_viz.files.triangles import grid_nodes
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.obstacles.occupancy import fit_occupancy
 from dt_viz.obstacles.solids import ByContent, Solid
-from dt_viz.obstacles.triangles import grid_nodes
 
 MIN_POINTS, MAX_POINTS = 50, 100_000
 """Smallest and largest number of points of a cloud."""

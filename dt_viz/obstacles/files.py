@@ -8,18 +8,21 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from dt_viz.errors import Cancelled, DataError, FormatError, never, parsing
 from dt_viz.files.checks import check_triangles, checked_suffix
+from dt_viz.files.grids import Distances, GridSettings, Shape
 from dt_viz.files.shapes import Points, Triangles
 from dt_viz.files.uploads import read_upload
-from dt_viz.flows.fields import Array
+from dt_viz.flows.fields import Array, Indices
 from dt_viz.obstacles.clouds import MAX_POINTS, Cloud, check_points
-from dt_viz.obstacles.solids import Solid
+from dt_viz.obstacles.solids import Solid, computed_by
 
 MAX_BYTES = 20 * 10**6
 """Largest number of bytes of a file."""
@@ -68,6 +71,35 @@ def is_cloud(content: bytes, source: str | Path) -> bool:
     return suffix in CLOUD_SUFFIXES
 
 
+def measured_apart(cancelled: Cancelled) -> AbstractContextManager[None]:
+    """Within the block have the distances of solids computed by the process that reads visitors' files.
+
+    It raises FormatError where they cannot be, and UnwantedError when nobody wants them any more.
+    """
+    return computed_by(partial(_measured, cancelled))
+
+
+def _measured(
+    cancelled: Cancelled,
+    vertices: Array,
+    faces: Indices,
+    origin: Array,
+    cell: float,
+    shape: Shape,
+    settings: GridSettings,
+) -> Array:
+    """Return `dt_viz.files.grids.signed_distances`, computed there. Raises as :func:`measured_apart` says."""
+    options = {"origin": origin.tolist(), "cell": cell, "shape": shape, "settings": asdict(settings)}
+    files = [("vertices", vertices.tobytes()), ("faces", faces.tobytes())]
+    values = read_upload(Distances, files, cancelled, **options).values
+    if values.shape != shape:
+        raise FormatError("distances", f"shape {values.shape}", f"shape {shape}")
+    beside = values[tuple(np.rint((vertices[np.unique(faces)] - origin) / cell).astype(np.intp).T)]
+    if np.abs(values).max() > cell * np.linalg.norm(shape) or np.median(np.abs(beside)) > cell:
+        raise FormatError("distances", "those of something else", "those of this mesh, small beside its vertices")
+    return values
+
+
 def read_mesh(
     content: bytes, source: str | Path, *, scale: float = 1.0, cancelled: Cancelled = never
 ) -> tuple[Solid, tuple[str, ...]]:
@@ -81,11 +113,11 @@ def read_mesh(
             raised, whatever the file holds.
         UnwantedError: nobody wants it any more.
     """
-    with _reading(content, source, MESH_SUFFIXES, scale) as files:
+    with _reading(content, source, MESH_SUFFIXES, scale) as files, measured_apart(cancelled):
         read = read_upload(Triangles, files, cancelled)
         check_triangles(read.vertices, read.faces)
-        corners = read.vertices[read.faces]
-        solid = Solid(_in_metres(read.vertices, corners.reshape(-1, 3), source, scale), read.faces)
+        used = read.vertices[np.unique(read.faces)]
+        solid = Solid(_in_metres(read.vertices, used, source, scale), read.faces)
         grid = solid.distances
         if not grid.depth > 0:
             found = f"walls thinner than {1e3 * grid.cell:.1f} mm, which leave nothing inside"
@@ -100,7 +132,7 @@ def read_cloud(
     content: bytes, source: str | Path, *, scale: float = 1.0, cancelled: Cancelled = never
 ) -> tuple[Cloud, tuple[str, ...]]:
     """Read a point cloud from the bytes of a file; arguments, notes and errors as of :func:`read_mesh`."""
-    with _reading(content, source, CLOUD_SUFFIXES, scale) as files:
+    with _reading(content, source, CLOUD_SUFFIXES, scale) as files, measured_apart(cancelled):
         read = read_upload(Points, files, cancelled)
         points, labels, notes = read.points, read.labels, read.notes
         check_points(points, labels)

@@ -22,10 +22,10 @@ from scipy import ndimage
 from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
+from dt_viz.files.triangles import grid_nodes, inside_of_grid, surface_samples
 from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.kernels.arm import BODY_POINT
 from dt_viz.kernels.bounding import step_to_the_farthest
-from dt_viz.obstacles.triangles import grid_nodes, inside_of_grid, surface_samples
 from dt_viz.robot.meshes import LinkMesh, cells
 
 Progress = Callable[[float], object]

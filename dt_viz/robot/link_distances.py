@@ -19,9 +19,9 @@ from typing import NamedTuple
 import coal
 import numpy as np
 
+from dt_viz.files.triangles import grid_nodes, inside_of_grid, surface_samples
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.obstacles.shapes import Box, Cylinder, Obstacle, Sphere, rotation
-from dt_viz.obstacles.triangles import grid_nodes, inside_of_grid, surface_samples
 from dt_viz.robot.kinematics import Kinematics
 from dt_viz.robot.meshes import LinkMesh, cells
 

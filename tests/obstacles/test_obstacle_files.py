@@ -64,8 +64,8 @@ def refusal(read, content: bytes, name: str, **options) -> str:
 def _in_this_process(monkeypatch):
     """The process that reads is for tests/files; starting one for each file takes a second."""
 
-    def read(kind, given, _cancelled):
-        first, arrays = worker.answer(kind.__name__, given)
+    def read(kind, given, _cancelled, **options):
+        first, arrays = worker.answer(kind.__name__, given, **options)
         if "refused" in first:
             raise FormatError(*first["refused"])
         return unpacked(first["value"], kind, "file", dict(zip(first["arrays"], arrays, strict=True)))

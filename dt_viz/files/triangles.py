@@ -6,8 +6,7 @@ import numpy as np
 from scipy import ndimage
 
 from dt_viz.errors import FormatError
-from dt_viz.flows.fields import Array, Indices, Mask
-from dt_viz.numerics import divisor
+from dt_viz.numerics import Array, Indices, Mask, divisor
 
 MAX_DISPUTED = 0.02
 """Largest number of nodes off the surface on which the directions may disagree, relative to that inside. Meshes that
