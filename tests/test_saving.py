@@ -20,11 +20,13 @@ import dt_viz as dt
 from dt_viz.avoidance import registry
 from dt_viz.avoidance.detour import DetourSettings
 from dt_viz.avoidance.transform import Transform
+from dt_viz.errors import never
 from dt_viz.files import npz
 from dt_viz.files.values import packed, unpacked
 from dt_viz.learning.demonstrations import Demonstration
+from dt_viz.obstacles import clouds, solids
 from dt_viz.obstacles.shapes import SHAPES, MeshObstacle, Obstacle
-from dt_viz.saving import FORMAT, MAX_BYTES, read_motion
+from dt_viz.saving import FORMAT, MAX_BYTES, read_motion, sent_motion_task
 from dt_viz.shipped import ASSETS
 
 FROZEN = Path(__file__).parent / "frozen"
@@ -421,6 +423,15 @@ def test_mutated_files_are_read_or_refused(saved, num):
         assert all(isinstance(layer.transform, tuple(registry.KINDS)) for layer in motion.layers)
         assert np.isfinite(imitation.starts).all() and len(imitation.starts)
     assert 0.02 * num < num_read < 0.7 * num
+
+
+@pytest.mark.long
+def test_shapes_of_a_motion_that_a_visitor_has_sent_are_measured_in_another_process(monkeypatch):
+    for kept in (solids._distances, clouds._solid):
+        kept.cache_clear()
+    monkeypatch.setattr(solids._thread, "compute", None)  # not here
+    task = sent_motion_task("a.npz", hostile.sent_motion(), never)
+    assert [part.depth > 0 for layer in task.layers for part in layer.transform.avoided.parts] == [True] * len(SHAPED)
 
 
 def test_meshes_are_shared_by_content(flat, tmp_path):

@@ -5,6 +5,7 @@ import sys
 import textwrap
 import threading
 import time
+from dataclasses import astuple
 from pathlib import Path
 from typing import cast
 
@@ -19,9 +20,11 @@ from dt_viz.errors import FormatError, UnwantedError
 from dt_viz.files import uploads, worker
 from dt_viz.files.shapes import Triangles
 from dt_viz.files.uploads import read_upload
-from dt_viz.obstacles.files import ShapeError, read_mesh
+from dt_viz.obstacles import solids
+from dt_viz.obstacles.files import ShapeError, read_cloud, read_mesh
 
 BOX = cast(bytes, trimesh.creation.box((0.15, 0.1, 0.05)).export(file_type="stl"))
+POINTS = np.random.default_rng(0).uniform(-0.1, 0.1, (200, 3))
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="limits as Linux has them")
 
 
@@ -105,6 +108,24 @@ def test_a_reader_that_ends_its_parent_is_ended_with_it(reader, tmp_path):
         read_mesh(BOX, "a.stl")
     (file,) = tmp_path.glob("*.pid")
     wait_until(lambda: not leftovers._read(leftovers.PROC / file.read_text() / "cmdline"))
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("kept")
+def test_distances_are_computed_by_that_process_to_the_last_bit(monkeypatch):
+    monkeypatch.setattr(solids, "SETTINGS", solids.GridSettings(num_nodes=20**3, num_samples=6000))
+    solids._distances.cache_clear()
+    with monkeypatch.context() as patch:
+        patch.setattr(solids._thread, "compute", None)  # not here
+        mesh, _ = read_mesh(BOX, "a.stl")
+        cloud, _ = read_cloud("\n".join(["x,y,z", *(f"{x},{y},{z}" for x, y, z in POINTS)]).encode(), "a.csv")
+        read = mesh.distances, cloud.solid.distances
+    solids._distances.cache_clear()
+    for found, here in zip(read, (mesh.distances, cloud.solid.distances), strict=True):
+        assert found is not here
+        assert [np.asarray(part).tobytes() for part in astuple(found)] == [
+            np.asarray(part).tobytes() for part in astuple(here)
+        ]
 
 
 @pytest.mark.usefixtures("kept")

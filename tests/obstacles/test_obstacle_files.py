@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from dt_viz.errors import FormatError
-from dt_viz.files import worker
+from dt_viz.errors import FormatError, UnwantedError, end_if
+from dt_viz.files import grids, worker
 from dt_viz.files.checks import MAX_FACES
+from dt_viz.files.shapes import Triangles
 from dt_viz.files.values import unpacked
 from dt_viz.obstacles import clouds, files, solids
 from dt_viz.obstacles.files import MAX_BYTES, ShapeError, read_cloud, read_mesh
@@ -175,6 +176,43 @@ class TestMeshes:
         MeshObstacle((0.0, 0.0, 0.0), solid).field("free-space", 3.0)
         assert len(solid.faces) == 81_920
         assert time.thread_time() - start < 20  # a tenth of it on a machine at rest
+
+
+DISTANCES = {
+    "fewer nodes": (lambda values: values[1:], "distances: found shape"),
+    "flat": (lambda values: values.ravel(), "distances: found shape"),
+    "integers": (lambda values: (1e3 * values).astype(int), "accepted: the name of an array of finite float64"),
+    "nan": (lambda values: np.where(values < 0, np.nan, values), "accepted: the name of an array of finite float64"),
+    "huge": (lambda values: np.where(values < -0.02, -1e300, values), "distances: found those of something else"),
+    "of a larger mesh": (lambda values: values - 0.02, "distances: found those of something else"),
+    "of a mesh elsewhere": (lambda values: np.roll(values, 4, axis=1), "distances: found those of something else"),
+}
+"""What the process that reads makes of a mesh's distances, and words of the refusal."""
+
+
+@pytest.mark.usefixtures("coarse")
+class TestDistances:
+    @pytest.mark.parametrize("change", DISTANCES)
+    def test_other_distances_are_refused(self, monkeypatch, change):
+        changed, words = DISTANCES[change]
+        right = grids.signed_distances
+        monkeypatch.setattr(grids, "signed_distances", lambda *given: changed(right(*given)))
+        solids._distances.cache_clear()
+        assert words in refusal(read_mesh, exported(trimesh.creation.icosphere(3, 0.07), "ply"), "a.ply")
+
+    def test_a_mesh_that_nobody_wants_any_more_is_not_measured(self, monkeypatch):
+        left, read = [], files.read_upload
+
+        def read_and_leave(kind, given, cancelled, **options):
+            end_if(cancelled)
+            left.append(kind)
+            return read(kind, given, cancelled, **options)
+
+        monkeypatch.setattr(files, "read_upload", read_and_leave)
+        solids._distances.cache_clear()
+        with pytest.raises(UnwantedError):
+            read_mesh(exported(BOX, "ply"), "a.ply", cancelled=lambda: bool(left))
+        assert left == [Triangles]
 
 
 @pytest.fixture
