@@ -21,7 +21,7 @@ from dt_viz.avoidance import registry
 from dt_viz.avoidance.detour import DetourSettings
 from dt_viz.avoidance.transform import Transform
 from dt_viz.errors import never
-from dt_viz.files import npz
+from dt_viz.files import npz, triangles
 from dt_viz.files.values import packed, unpacked
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.obstacles import clouds, solids
@@ -429,7 +429,7 @@ def test_mutated_files_are_read_or_refused(saved, num):
 def test_shapes_of_a_motion_that_a_visitor_has_sent_are_measured_in_another_process(monkeypatch):
     for kept in (solids._distances, clouds._solid):
         kept.cache_clear()
-    monkeypatch.setattr(solids._thread, "compute", None)  # not here
+    monkeypatch.setattr(triangles, "inside_of_grid", None)  # not here
     task = sent_motion_task("a.npz", hostile.sent_motion(), never)
     assert [part.depth > 0 for layer in task.layers for part in layer.transform.avoided.parts] == [True] * len(SHAPED)
 

@@ -22,11 +22,11 @@ from typing import Any
 import numpy as np
 
 from dt_viz.errors import FormatError
-from dt_viz.files.grids import Distances, read_distances
 from dt_viz.files.npz import Archive, read_archive
 from dt_viz.files.processes import stand_back
 from dt_viz.files.recordings import Recordings, read_recordings
 from dt_viz.files.shapes import Points, Triangles, read_points, read_triangles
+from dt_viz.files.triangles import Distances, read_distances
 from dt_viz.files.values import packed
 
 REQUEST, ANSWER = "request", "answer"

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
-from dataclasses import asdict
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -17,12 +16,12 @@ import numpy as np
 
 from dt_viz.errors import Cancelled, DataError, FormatError, never, parsing
 from dt_viz.files.checks import check_triangles, checked_suffix
-from dt_viz.files.grids import Distances, GridSettings, Shape
 from dt_viz.files.shapes import Points, Triangles
+from dt_viz.files.triangles import Distances
 from dt_viz.files.uploads import read_upload
-from dt_viz.flows.fields import Array, Indices
+from dt_viz.flows.fields import Array
 from dt_viz.obstacles.clouds import MAX_POINTS, Cloud, check_points
-from dt_viz.obstacles.solids import Solid, computed_by
+from dt_viz.obstacles.solids import MEASURE, Solid
 
 MAX_BYTES = 20 * 10**6
 """Largest number of bytes of a file."""
@@ -71,33 +70,14 @@ def is_cloud(content: bytes, source: str | Path) -> bool:
     return suffix in CLOUD_SUFFIXES
 
 
-def measured_apart(cancelled: Cancelled) -> AbstractContextManager[None]:
-    """Within the block have the distances of solids computed by the process that reads visitors' files.
-
-    It raises FormatError where they cannot be, and UnwantedError when nobody wants them any more.
-    """
-    return computed_by(partial(_measured, cancelled))
-
-
-def _measured(
-    cancelled: Cancelled,
-    vertices: Array,
-    faces: Indices,
-    origin: Array,
-    cell: float,
-    shape: Shape,
-    settings: GridSettings,
-) -> Array:
-    """Return `dt_viz.files.grids.signed_distances`, computed there. Raises as :func:`measured_apart` says."""
-    options = {"origin": origin.tolist(), "cell": cell, "shape": shape, "settings": asdict(settings)}
-    files = [("vertices", vertices.tobytes()), ("faces", faces.tobytes())]
-    values = read_upload(Distances, files, cancelled, **options).values
-    if values.shape != shape:
-        raise FormatError("distances", f"shape {values.shape}", f"shape {shape}")
-    beside = values[tuple(np.rint((vertices[np.unique(faces)] - origin) / cell).astype(np.intp).T)]
-    if np.abs(values).max() > cell * np.linalg.norm(shape) or np.median(np.abs(beside)) > cell:
-        raise FormatError("distances", "those of something else", "those of this mesh, small beside its vertices")
-    return values
+@contextmanager
+def measured_apart(cancelled: Cancelled) -> Iterator[None]:
+    """Within the block have meshes measured by the process that reads files, with the errors of `read_upload`."""
+    token = MEASURE.set(partial(read_upload, Distances, cancelled=cancelled))
+    try:
+        yield
+    finally:
+        MEASURE.reset(token)
 
 
 def read_mesh(

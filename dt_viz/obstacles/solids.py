@@ -8,26 +8,24 @@ distances: its slope is continuous and, up to the discretisation, at most 1.
 from __future__ import annotations
 
 import hashlib
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable
+from contextvars import ContextVar
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 
-from dt_viz.errors import check_between
+from dt_viz.errors import FormatError, check_between
 from dt_viz.files.checks import check_triangles
-from dt_viz.files.grids import GridSettings, Shape, signed_distances
-from dt_viz.files.triangles import grid_nodes
+from dt_viz.files.triangles import Distances, GridSettings, grid_nodes, read_distances
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.kernels.distances import GRID, SHAPE, Values, batch, distances
 from dt_viz.obstacles.covers import cells_cover
 
-Compute = Callable[[Array, Indices, Array, float, Shape, GridSettings], Array]
-"""What computes as `dt_viz.files.grids.signed_distances`."""
 SETTINGS = GridSettings()
+MEASURE: ContextVar[Callable[..., Distances]] = ContextVar("measure", default=read_distances)
+"""What is called as `read_distances` for a solid whose distances are not known."""
 SMALLEST = 1e-9
 """Smallest size of a solid, and inverse of the largest, in its own unit."""
 
@@ -171,23 +169,6 @@ def with_slopes(distance: Callable[[Array], Array], s: Array) -> tuple[Array, Ar
     return ahead[0].real, ahead.imag.T / step
 
 
-class _Thread(threading.local):
-    compute: Compute = staticmethod(signed_distances)
-
-
-_thread = _Thread()
-
-
-@contextmanager
-def computed_by(compute: Compute) -> Iterator[None]:
-    """Have distances that are not known yet computed otherwise, where this thread needs them within the block."""
-    before, _thread.compute = _thread.compute, compute
-    try:
-        yield
-    finally:
-        _thread.compute = before
-
-
 @lru_cache(maxsize=16)
 def _distances(solid: Solid) -> DistanceGrid:
     lower, upper = solid.bounds
@@ -197,8 +178,13 @@ def _distances(solid: Solid) -> DistanceGrid:
     counts = np.ceil(size / cell).astype(int) + 2  # the outermost nodes are for the spline only
     centre = (lower + upper) / 2
     origin = centre - cell * (counts - 1) / 2
-    shape = (int(counts[0]), int(counts[1]), int(counts[2]))
-    signed = _thread.compute(solid.vertices, solid.faces, origin, cell, shape, SETTINGS)
+    shape = tuple(counts.tolist())
+    files = [("vertices", solid.vertices.tobytes()), ("faces", solid.faces.tobytes())]
+    grid = {"origin": origin.tolist(), "cell": cell, "shape": shape}
+    signed = MEASURE.get()(files, **grid, settings=asdict(SETTINGS)).values
+    beside, largest = tuple(np.rint((solid.used - origin) / cell).astype(int).T), cell * np.linalg.norm(shape)
+    if signed.shape != shape or np.abs(signed).max() > largest or np.median(np.abs(signed[beside])) > 2 * cell:
+        raise FormatError("distances", "those of something else", "those of its grid from this mesh")
     radius = float(np.linalg.norm(solid.used - centre, axis=1).max())
     grid = DistanceGrid(origin, cell, signed, margin, centre, radius)
     # steeper than 1 by a percent or two beside edges

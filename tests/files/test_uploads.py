@@ -17,7 +17,7 @@ from pages import PATIENCE, wait_until
 
 from dt_viz.accounts import Account, QuotaSettings, charged
 from dt_viz.errors import FormatError, UnwantedError
-from dt_viz.files import uploads, worker
+from dt_viz.files import triangles, uploads, worker
 from dt_viz.files.shapes import Triangles
 from dt_viz.files.uploads import read_upload
 from dt_viz.obstacles import solids
@@ -116,7 +116,7 @@ def test_distances_are_computed_by_that_process_to_the_last_bit(monkeypatch):
     monkeypatch.setattr(solids, "SETTINGS", solids.GridSettings(num_nodes=20**3, num_samples=6000))
     solids._distances.cache_clear()
     with monkeypatch.context() as patch:
-        patch.setattr(solids._thread, "compute", None)  # not here
+        patch.setattr(triangles, "inside_of_grid", None)  # not here
         mesh, _ = read_mesh(BOX, "a.stl")
         cloud, _ = read_cloud("\n".join(["x,y,z", *(f"{x},{y},{z}" for x, y, z in POINTS)]).encode(), "a.csv")
         read = mesh.distances, cloud.solid.distances

@@ -11,7 +11,7 @@ import pytest
 import trimesh
 
 from dt_viz.errors import FormatError, UnwantedError, end_if
-from dt_viz.files import grids, worker
+from dt_viz.files import triangles, worker
 from dt_viz.files.checks import MAX_FACES
 from dt_viz.files.shapes import Triangles
 from dt_viz.files.values import unpacked
@@ -65,7 +65,7 @@ def refusal(read, content: bytes, name: str, **options) -> str:
 def _in_this_process(monkeypatch):
     """The process that reads is for tests/files; starting one for each file takes a second."""
 
-    def read(kind, given, _cancelled, **options):
+    def read(kind, given, cancelled, **options):
         first, arrays = worker.answer(kind.__name__, given, **options)
         if "refused" in first:
             raise FormatError(*first["refused"])
@@ -179,13 +179,13 @@ class TestMeshes:
 
 
 DISTANCES = {
-    "fewer nodes": (lambda values: values[1:], "distances: found shape"),
-    "flat": (lambda values: values.ravel(), "distances: found shape"),
+    "fewer nodes": (lambda values: values[1:], "distances: found those of something else"),
+    "flat": (lambda values: values.ravel(), "distances: found those of something else"),
     "integers": (lambda values: (1e3 * values).astype(int), "accepted: the name of an array of finite float64"),
     "nan": (lambda values: np.where(values < 0, np.nan, values), "accepted: the name of an array of finite float64"),
     "huge": (lambda values: np.where(values < -0.02, -1e300, values), "distances: found those of something else"),
     "of a larger mesh": (lambda values: values - 0.02, "distances: found those of something else"),
-    "of a mesh elsewhere": (lambda values: np.roll(values, 4, axis=1), "distances: found those of something else"),
+    "of a mesh elsewhere": (lambda values: np.roll(values, 8, axis=1), "distances: found those of something else"),
 }
 """What the process that reads makes of a mesh's distances, and words of the refusal."""
 
@@ -195,8 +195,9 @@ class TestDistances:
     @pytest.mark.parametrize("change", DISTANCES)
     def test_other_distances_are_refused(self, monkeypatch, change):
         changed, words = DISTANCES[change]
-        right = grids.signed_distances
-        monkeypatch.setattr(grids, "signed_distances", lambda *given: changed(right(*given)))
+        right = triangles.read_distances
+        wrong = lambda *given, **grid: triangles.Distances(changed(right(*given, **grid).values))  # noqa: E731
+        monkeypatch.setattr(worker, "READERS", {**worker.READERS, "Distances": wrong})
         solids._distances.cache_clear()
         assert words in refusal(read_mesh, exported(trimesh.creation.icosphere(3, 0.07), "ply"), "a.ply")
 
