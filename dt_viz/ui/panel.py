@@ -129,7 +129,7 @@ class ControlPanel:
             add_arm(gui, bindings, arms, self.begin, lambda session: self.show.timeline.show(session, PAST))
             add_joints(gui, bindings, send)
         with tabs.add_tab("Compare"):
-            self._compare = ComparePanel(gui, bindings, send)
+            ComparePanel(gui, bindings, send)
         with tabs.add_tab("Picture"):
             act = {"darken": darken, "enlarge": enlarge, "render": render, "draw": self._draw, "record": record}
             picture = PictureTab(gui, bindings, tripod, self.presentation, film=film, send=send, **act)
@@ -173,7 +173,6 @@ class ControlPanel:
         if wanted is None or frame.scenario.begins_like(wanted):
             self.bindings.report(frame)
             self.show.draw(frame)
-            self._compare.draw(frame.comparison)
 
     def tell(self, progress: Progress) -> None:
         """Show the verdict on what is shown, its hint, and a message, which is for a while beside the panel, too."""

@@ -8,6 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from pages import frame_of
 
 from dt_viz.baselines.registry import METHODS
 from dt_viz.motion.following import ArmMotion
@@ -25,6 +26,15 @@ def read(content):
 @pytest.fixture
 def rng():
     return np.random.default_rng(0)
+
+
+def shown_by(page, method):
+    """Whether a method has a curve in each plot of Compare, below the table and in the window."""
+    groups = [box._children.values() for box in page.gui._container_handle_from_uuid.values()]
+    labels = [
+        [series.get("label") for series in each.series] for group in groups for each in group if hasattr(each, "series")
+    ]
+    return [method.title in those for those in labels if those[1:2] == [METHODS["ours"].title] or method.title in those]
 
 
 @pytest.fixture
@@ -89,13 +99,14 @@ def test_what_compared_methods_do_is_saved(page, sent, rng):
     scores = Scores(*rng.uniform(size=len(fields(Scores))))
     moves, waits = (METHODS[name] for name in ("linear", "mpnet"))
     drawn = rng.uniform(size=(NUM_SAMPLES, 2))
-    comparison = [
-        Compared(moves, scores=scores, curves=drawn),
-        Compared(waits, note="no way, yet"),
-    ]
+    comparison = Compared(moves, scores=scores, curves=drawn), Compared(waits, note="no way, yet")
     page.session.edit("test", view=View(compared=("linear", "mpnet")))
-    page.visitor._panel._compare.draw(comparison)
+    scenario = page.session.scenario
+    page.visitor._panel.bindings.report(frame_of(scenario, task=page.session.task, comparison=comparison))
     pressed(page)
+    assert shown_by(page, moves) == [True, True, False, False]  # the window is hidden
+    page.session.edit("test", view=View(compared=("linear", "mpnet"), large_plots=True))
+    assert shown_by(page, moves) == [True] * 4
     assert [name.removeprefix("dt-viz-draw_s") for name in sent] == ["-methods.csv", "-methods-path.csv"]
     table, curves = (read(content) for content in sent.values())
     assert table["method"] == [moves.title, waits.title] and table["note"] == ["", "no way, yet"]
