@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
+from types import MappingProxyType
 from typing import Any
 
 import viser
@@ -87,6 +88,7 @@ class ControlPanel:
         pen: Pen | None = None,
         storage: Storage | None = None,
         came_back: Callable[[Pose | None], None] = lambda _pose: None,
+        scenarios: Mapping[str, Callable[[], None]] = MappingProxyType({}),
     ) -> None:
         """Build the controls, for the titles of tasks and arms by name; they act once `connect` has given a session.
 
@@ -94,9 +96,9 @@ class ControlPanel:
         `save` sends the scenario as a file and must only submit, `record` makes a page that replays what is shown,
         `film` a video. `open_scenario` goes on with the scenario of a file if it holds one. A visitor teaches with the
         `pen`. The browser's `storage` keeps where the visitor is in the tour, at whose end `came_back` is called; see
-        `Tour`.
+        `Tour`. A link may name one of the `scenarios`, which begin when they are called.
         """
-        self._notify, self._titles = notify, dict(titles)
+        self._notify, self._titles, self._scenarios = notify, dict(titles), scenarios
         self._scenes = {scene.title: scene for scene in offered(self._titles)}
         self.bindings = bindings = Bindings()
         self.presentation = Presentation(gui, self._turn, lambda alone: tripod.reframe(alone=alone))
@@ -265,19 +267,19 @@ class ControlPanel:
         else:
             session.say(f"“{title}” is made for the JACO: choose it in Arm → Model.", Severity.WARNING)
 
-    def follow(self, session: Session, link: Link, scenarios: Mapping[str, Callable[[], None]]) -> None:
+    def follow(self, session: Session, link: Link) -> None:
         """Begin the scene, the task, the tour or the scenario that a link asks for; where there is none, say so."""
         scene = found(link.name, self._scenes.values()) if link.kind == "scene" else None
         names = {"scene": [each.name for each in self._scenes.values()], "task": self._titles, "tour": NUMBERS}
-        names["scenario"] = scenarios
+        names["scenario"] = self._scenarios
         if scene is not None:
             self.begin(self._load, session, scene.title)
         elif link.kind == "task" and link.name in self._titles:
             self.begin(lambda session, _title: session.begin_task(link.name), session, self._titles[link.name])
         elif link.kind == "tour" and link.name in ("", *NUMBERS):
             self.tour.take(session, int(link.name or 1) - 1)
-        elif link.kind == "scenario" and link.name in scenarios:
-            scenarios[link.name]()
+        elif link.kind == "scenario" and link.name in self._scenarios:
+            self._scenarios[link.name]()
         else:
             accepted = ", ".join(names[link.kind])[:200] or "none: this server offers none"
             text = f"The link: {link.kind}: found {link.name!r}; accepted: {accepted}"

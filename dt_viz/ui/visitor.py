@@ -154,6 +154,7 @@ class Visitor(Display):
             pen,
             client.local_storage,
             self._came_back,
+            {name: partial(self._resume, saved) for name, saved in scenarios.items()},
         )
         begun = self._keeper.begun
         at_once = None if begun is None or _takes_long(begun) else begun.scenario
@@ -162,7 +163,7 @@ class Visitor(Display):
         self._panel.connect(self.session)
         self._keeper.begin(self.session, self._resume)
         self._panel.tour.begin(self.session)
-        self.ruler = Ruler(scenarios)
+        self.ruler = Ruler()
         """What the visitor's window is measured with."""
         self.robot.playback.begin(self.session.jobs, self.session.fail)
         keep_ready(self)
@@ -174,8 +175,7 @@ class Visitor(Display):
     def told(self, what: float | Link) -> None:
         """Take the width of the window, CSS pixels, or begin what the link of the page asks for."""
         if isinstance(what, Link):
-            offered = self.ruler.scenarios.items()
-            self._panel.follow(self.session, what, {name: partial(self._resume, saved) for name, saved in offered})
+            self._panel.follow(self.session, what)
         else:
             self._camera.measured(what)
 
