@@ -101,7 +101,7 @@ def verdict(progress: Progress) -> Verdict:
     if known.lyapunov_falls is not None:
         figures += ("stable" if known.lyapunov_falls else "not stable",)
     if progress.wanted == progress.restored:
-        figures += ("restored",)
+        figures += ("as saved",)
     else:
         figures += (f"{1e3 * latency:.0f} ms" if latency < 1 else f"{latency:.1f} s",)
     head, severity, reason = _judged(frame, concerns(frame, view))
