@@ -16,7 +16,7 @@ import viser
 from dt_viz.accounts import Account
 from dt_viz.errors import Cancelled, DataError, FormatError, end_if, never
 from dt_viz.files.uploads import keep_ready, let_go
-from dt_viz.obstacles.shapes import Sphere, TriangleObstacle, as_point
+from dt_viz.obstacles.shapes import TriangleObstacle, as_point
 from dt_viz.pictures.video import check_installed
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.own import Own
@@ -69,8 +69,7 @@ def initial(task: Task) -> Scenario:
     scenario = Scenario(task.name)
     if task.layers:
         return replace(scenario, stack=in_world(task))
-    sphere = Sphere(task.obstacle_position, task.size * Sphere.diameter)
-    return replace(scenario, stack=with_avoidance(scenario, obstacles=(sphere,)))
+    return replace(scenario, stack=with_avoidance(scenario, obstacles=(task.sphere(),)))
 
 
 def known_names(tasks: Collection[str], arms: Collection[str]) -> Known:

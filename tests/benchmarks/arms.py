@@ -31,7 +31,6 @@ from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.control.controller import ArmController
 from dt_viz.evaluate.around import ALLOWANCE, in_ball, measured
 from dt_viz.evaluate.options import (
-    avoiding,
     interval,
     new_engine,
     report,
@@ -48,7 +47,7 @@ from dt_viz.robot.cover import protrusion
 from dt_viz.robot.inverse_kinematics import UnreachableError
 from dt_viz.robot.models import ARMS
 from dt_viz.scenario.scenario import Scenario
-from dt_viz.scenario.stack import with_avoidance
+from dt_viz.scenario.stack import avoiding, with_avoidance
 from dt_viz.scenario.tasks import TASKS, Task
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Stage
