@@ -38,7 +38,8 @@ MAY_IMPORT: Mapping[str, set[str]] = {
     "ui": BELOW_SESSION | {"kernels", "session", "baselines", "serving", "saving"},
     "evaluate": BELOW_SESSION | {"session", "baselines"},
     "examples": {"foundation"},
-    "picture": BELOW_SESSION | {"saving", "session", "ui"},
+    "picture_making": BELOW_SESSION | {"saving", "session", "ui"},
+    "picture": {"picture_making"},
     "cli": BELOW_SESSION | {"session", "serving", "ui", "evaluate", "saving", "picture"},
     "__main__": {"cli"},
 }

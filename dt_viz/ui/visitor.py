@@ -83,6 +83,11 @@ def _takes_long(saved: Saved) -> bool:
     return bool(saved.scenario.arm) or saved.own is not None or shapes
 
 
+def pose_of(sight: Sight | None) -> Pose | None:
+    """Return where a camera is that a scenario was saved with."""
+    return None if sight is None else (np.array(sight[0]), np.array(sight[1]))
+
+
 def _sight(pose: Pose | None) -> Sight | None:
     return None if pose is None else (as_point(pose[0]), as_point(pose[1]))
 
@@ -202,8 +207,8 @@ class Visitor(Display):
             self.robot.playback.resume()
         if self.shown is None or frame.task is not self.shown.task or others:
             self._camera.look(frame.task, beside)
-        if (sight := self._keeper.sight(frame)) is not None:
-            self._camera.choose((np.array(sight[0]), np.array(sight[1])))
+        if (pose := pose_of(self._keeper.sight(frame))) is not None:
+            self._camera.choose(pose)
             self._keeper.changed()
         with self.client.atomic():
             self.pictures.draw(frame)
@@ -361,7 +366,7 @@ class Visitor(Display):
         self.robot.playback.advance(0.0)
         self.client.flush()
         with self._studio.rendering():
-            pose = self._pose_alone(size) if sight is None else (np.array(sight[0]), np.array(sight[1]))
+            pose = pose_of(sight) or self._pose_alone(size)
             shot = shot_of(pose)
             if sight is not None:
                 shot = shot_beside(pose, shot.wxyz, Framing(), size)
