@@ -24,6 +24,7 @@ NAMES = (
     "soak",
     "capacity",
     "webassembly",
+    "documents",
 )
 PROG = "python -m tests.benchmarks"
 
