@@ -140,7 +140,9 @@ def test_only_the_page_talks_to_the_browser():
 
 
 def test_what_viser_keeps_to_itself_is_used_in_one_file():
-    private = re.compile(r"viser\._(?!_)|\._impl\b|\._queue_update\b|\._websock|websockets\.asyncio\.server\.serve")
+    private = re.compile(
+        r"viser\._(?!_)|\._impl\b|\._queue_update\b|\._websock|websockets\.asyncio\.server\.serve|:has\(|mantine-[A-Z]"
+    )
     page = [path for path in SOURCES if path.parent in {PACKAGE / "ui", PACKAGE / "ui" / "tabs"}]
     assert [path.name for path in page if private.search(path.read_text(encoding="utf-8"))] == ["patches.py"]
 

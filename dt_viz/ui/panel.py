@@ -22,14 +22,13 @@ from dt_viz.scenario.tasks import Task
 from dt_viz.session.frame import Frame
 from dt_viz.session.progress import Progress
 from dt_viz.session.session import CHOICES, Session
+from dt_viz.ui import patches
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.controls import Control
 from dt_viz.ui.keeping import Storage
 from dt_viz.ui.pen import Pen
-from dt_viz.ui.playback import Playback
 from dt_viz.ui.scene.camera import CameraController, Pose
 from dt_viz.ui.scene.figure import render_figure
-from dt_viz.ui.scene.legend import Legend
 from dt_viz.ui.scene.palette import Colour
 from dt_viz.ui.scripts import Link
 from dt_viz.ui.tabs.about import Command, add_about, add_commands, numbered
@@ -51,15 +50,6 @@ MAX_UPLOAD = 50 * 10**6
 """Largest number of bytes of what a visitor sends."""
 NO_SCENE = "–"
 OFF = "Off"
-STYLE = """<style>
-[data-dock-tab] { padding: 0 0.45em !important; }
-@media (max-width: 36em) {
-    .mantine-Paper-root:has([role="status"]), .mantine-ScrollArea-content > div:has([role="status"]) {
-        width: 100% !important;
-    }
-}
-</style>"""
-"""Style of the panel: all tabs lie in one row, and on a phone it is as wide as the window."""
 SAVE_HINT = "Save: all that you have made, your own demonstrations too, as a file; “Open a file” goes on with it"
 SPACES: Mapping[str, Space] = {"Hand": "task", "Arm": "cspace"}
 """Spaces of the avoidance, by their names on the page."""
@@ -117,7 +107,7 @@ class ControlPanel:
         travels = {"Undo": Session.undo, "Redo": Session.redo, "Reset": reset, "Save": save}
         buttons = gui.add_button_group("History", tuple(travels), hint=SAVE_HINT)
         bindings.on(buttons, lambda session, button: travels[button](session))
-        gui.add_html(STYLE)
+        gui.add_html(patches.PANEL)
         tabs = gui.add_tab_group()
         with tabs.add_tab("World"):
             loader = add_obstacles(gui, bindings)
@@ -152,18 +142,9 @@ class ControlPanel:
         self.bindings.connect(session)
 
     @property
-    def legend(self) -> Legend | None:
-        """Legend of the colours on the slice."""
-        return self.show.legend
-
-    @property
     def headline(self) -> str:
         """Title and status of what is shown, as HTML."""
         return f"<h3 style='margin:0.4em 0.7em'>{self.presentation.title}</h3>{self.status.judgement}"
-
-    def pose(self, playback: Playback) -> None:
-        """Show what a playback shows now on the timeline; called by its thread."""
-        self.show.timeline.follow(playback)
 
     def adopt(self, scenario: Scenario) -> None:
         """Show the scenario's choices."""
@@ -174,7 +155,7 @@ class ControlPanel:
         wanted = self.bindings.scenario
         if wanted is None or frame.scenario.begins_like(wanted):
             self.bindings.report(frame)
-            self.show.draw(frame)
+            self.show.plots.draw(frame)
 
     def tell(self, progress: Progress) -> None:
         """Show the verdict on what is shown, its hint, and a message, which is for a while beside the panel, too."""

@@ -310,7 +310,7 @@ class Visitor(Display):
         with self._exchanging:
             if self.robot.playback.film is None:
                 self.robot.pose(now, self.pictures.look.tubes)
-                self._panel.pose(self.robot.playback)
+                self._panel.show.timeline.follow(self.robot.playback)
         self.session.let_pass()
 
     def _exchange(self, name: str) -> None:
@@ -475,7 +475,7 @@ class Visitor(Display):
     @property
     def _legends(self) -> list[Legend | Key]:
         """What explains the colours of a picture."""
-        legend = self._panel.legend
+        legend = self._panel.show.legend
         return [*([] if legend is None else [legend]), *self.pictures.keys]
 
     @property
