@@ -62,7 +62,7 @@ SUBJECTS: Mapping[str, Subject] = {
         ),
         ".json",
     ),
-    "fairness": Subject("Beside somebody who takes all that he can get", ("fairness --rounds 3",), ".json"),
+    "fairness": Subject("Beside somebody who takes all that he can get", ("fairness --rounds 2",), ".json"),
     "scenes": Subject("Scenes of the paper", ("scenes",), ".json"),
     "exactness": Subject(
         "Exact rollouts",
@@ -110,7 +110,7 @@ SUBJECTS: Mapping[str, Subject] = {
         ".npz",
         1,
     ),
-    "arms": Subject("Other arms", ("arms --count 10 --seed 7",), ".npz"),
+    "arms": Subject("Other arms", ("arms --count 5 --seed 7",), ".npz"),
     "table1": Subject("The paper's comparison", ("table1 --perturbed 60 --jobs 2",), ""),
 }
 
