@@ -7,7 +7,7 @@ out of an obstacle; `JointLimits` bends Rⁿ so that no flow leaves the joint li
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -164,6 +164,7 @@ class JointLimits(Diffeomorphism):
     Joints outside the zone, and continuous ones, are not changed.
     """
 
+    SCALED = ("fraction",)
     lower: Array
     """(n,) rad, −inf for continuous joints."""
     upper: Array
@@ -171,16 +172,12 @@ class JointLimits(Diffeomorphism):
     zone: float = LIMIT_ZONE
     """m, rad."""
     fraction: float = 1.0
-    """Part s of that time: (e/m)² becomes s·(e/m)² in both formulas."""
+    """Part s of that time: (e/m)² becomes s·(e/m)² in both formulas; less than 1 holds no joint inside its limits."""
 
     @property
     def dim(self) -> int:
         """Dimension of configuration space."""
         return len(self.lower)
-
-    def scaled(self, fraction: float) -> JointLimits:
-        """A part of the flow does not hold joints inside their limits."""
-        return replace(self, fraction=fraction * self.fraction)
 
     def inside(self, q: Array) -> Array:
         """Clip configurations (*B, n) to a little less than the limits, where ψ is finite."""

@@ -15,7 +15,7 @@ from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.avoidance.clearing import Lack, clearing_duration
 from dt_viz.avoidance.detour import Detour
 from dt_viz.avoidance.lift import Lift
-from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Diffeomorphism, Flow, Identity
+from dt_viz.flows.diffeomorphisms import Conjugated, Diffeomorphism, Flow, Identity
 from dt_viz.flows.fields import Array, Indices, Mask, VectorField
 from dt_viz.flows.rollouts import Bundle, refined
 from dt_viz.kernels.blocks import room_asked
@@ -202,7 +202,7 @@ class Solver:
         elif self._coarse:
             flow = Flow(self._generator, duration, math.ceil(duration / COARSE_STEP))
         else:
-            flow = AdaptiveFlow(self._generator, duration, TOLERANCE)
+            flow = Flow.adaptive(self._generator, duration, TOLERANCE)
         return Conjugated(flow, limits)
 
     def _evaluate(self, transform: Diffeomorphism, index: Indices, fraction: Array) -> Array:

@@ -190,7 +190,7 @@ def fold_warnings(
 
 def _stepped(flow: Diffeomorphism, y: Array, x: Array) -> Iterator[tuple[Flow, Array, Array]]:
     """The parts of ψ that take equal steps, with the samples (N, d) above and below each, in its coordinates."""
-    if isinstance(flow, Flow):
+    if isinstance(flow, Flow) and not flow.tolerance:
         yield flow, y, x
     elif isinstance(flow, Conjugated):
         yield from _stepped(flow.inner, flow.by.forward(y), flow.by.forward(x))
