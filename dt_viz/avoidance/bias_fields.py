@@ -31,11 +31,6 @@ class RegionField(PointField):
     directions: GridRBF
     """V_fit, in R^k."""
 
-    @property
-    def dim(self) -> int:
-        """Dimension of the space."""
-        return 3
-
     def _terms(self) -> Terms:
         return self.directions.grid.terms(self.directions.weights, REGION)
 
@@ -48,11 +43,6 @@ class Shift(PointField):
     """n, (3,), a unit vector."""
     dim_of_region: int
     """3 for the ball, 2 for the cylinder."""
-
-    @property
-    def dim(self) -> int:
-        """Dimension of the space."""
-        return 3
 
     def _terms(self) -> Terms:
         term = np.zeros(1, TERM)

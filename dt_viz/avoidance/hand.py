@@ -17,6 +17,7 @@ from dt_viz.avoidance.start_status import start_warnings
 from dt_viz.avoidance.transform import Built, MotionBelow, Planar, axes_of
 from dt_viz.flows.diffeomorphisms import Chain, Diffeomorphism, Flow
 from dt_viz.flows.fields import Array, Mask, Projected, VectorField
+from dt_viz.metrics import arc_length
 from dt_viz.obstacles.shapes import Obstacle, Point
 from dt_viz.obstacles.union import Union, escape_lengths
 from dt_viz.warning import Kind, MotionWarning, in_millimetres
@@ -228,7 +229,7 @@ class HandAvoidance(Avoidance, Planar, space="task"):
                 avoidable[rows[: outside[0] if len(outside) else None]] = False
             if goal_covered:
                 path = motion.positions[rows]
-                to_end = np.append(np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1)[::-1])[::-1], 0)
+                to_end = arc_length(path[::-1])[::-1]
                 tail = to_end <= TAIL * np.linalg.norm(path[-1] - instead) + BESIDE
                 tail[: outside[-1] + 1 if len(outside) else 0] = False
                 avoidable[rows[tail]] = False

@@ -22,6 +22,7 @@ from dt_viz.avoidance.transform import MotionBelow
 from dt_viz.flows.diffeomorphisms import Diffeomorphism, Flow
 from dt_viz.flows.fields import Array, Mask, PointField
 from dt_viz.kernels.fields import ASIDE, TERM, Terms
+from dt_viz.numerics import unit
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.union import Union, escape_lengths
 
@@ -58,11 +59,6 @@ class Sideways(PointField):
     """e, (E, 3), metres."""
     radii: Array
     """ρ_e, (E,), metres."""
-
-    @property
-    def dim(self) -> int:
-        """Dimension of the space."""
-        return 3
 
     def _terms(self) -> Terms:
         term, ends = np.zeros(1, TERM), np.column_stack([self.ends, self.radii])
@@ -117,8 +113,7 @@ class Encounter:
         of_next = motion.index[np.minimum(inside + 1, len(motion.index) - 1)] == motion.index[inside]
         of_last = motion.index[np.maximum(inside - 1, 0)] == motion.index[inside]
         after, before = (np.clip(inside + by, 0, len(motion.index) - 1) for by in (of_next, -1 * of_last))
-        tangents = motion.positions[after] - motion.positions[before]
-        tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
+        tangents = unit(motion.positions[after] - motion.positions[before])
         ends = np.concatenate([motion.starts, motion.goal[None]])
         ends = ends[obstacle.signed_distance(ends) >= 0]
         return cls(obstacle, margin, motion.positions[inside], tangents, ends, tuple(others), plane)

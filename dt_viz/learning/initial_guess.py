@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from dt_viz.flows.fields import Array
 from dt_viz.learning.flow_chain import FlowChain, FlowLayer
+from dt_viz.numerics import unit
 
 SMOOTHING = 0.04  # width of the filter for tangents, as a fraction of the motion; half of it to find what winds
 MAX_TURN = (
@@ -123,8 +124,7 @@ def _axis(mean: Array) -> Array | None:
 
 def _tangents(mean: Array, smoothing: float) -> Array:
     """Compute unit tangents (n, d) of a motion, smoothed over a part of it."""
-    tangents = np.gradient(gaussian_filter1d(mean, smoothing * len(mean), axis=0, mode="nearest"), axis=0)
-    return tangents / np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
+    return unit(np.gradient(gaussian_filter1d(mean, smoothing * len(mean), axis=0, mode="nearest"), axis=0))
 
 
 def _middle(turned: Array) -> Array:

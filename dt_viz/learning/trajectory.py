@@ -15,6 +15,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from dt_viz.flows.fields import Array
 from dt_viz.learning.flow_chain import FlowChain
+from dt_viz.numerics import unit
 
 IMAGE_PRIOR = 1e-7  # damping of the images of the rays' ends, which could otherwise drift
 
@@ -39,8 +40,7 @@ class TrajectoryFit:
     def weights(self) -> Array:
         """Return the matrices (R, n, d, d) that weight the residual vectors."""
         d = self.chain.dim
-        tangents = np.gradient(self.targets, axis=1)
-        tangents /= np.maximum(np.linalg.norm(tangents, axis=-1, keepdims=True), 1e-12)
+        tangents = unit(np.gradient(self.targets, axis=1))
         weights = np.eye(d) - (1 - self.along_weight) * tangents[..., :, None] * tangents[..., None, :]
         weights[:, [0, -1]] = self.end_weight * np.eye(d)
         return np.sqrt(self.importance / self.importance.mean())[:, None, None, None] * weights
