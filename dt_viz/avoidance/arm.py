@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from dt_viz.avoidance.arm_field import JointLimits, WholeArmField
 from dt_viz.avoidance.arm_settings import WholeArmSettings
-from dt_viz.avoidance.arm_solver import MAX_DURATION, ROUNDING, SLOPE, ArmSolution, Solver
+from dt_viz.avoidance.arm_solver import MARGIN_TOLERANCE, MAX_DURATION, SLOPE, ArmSolution, Solver
 from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.avoidance.detour import Detour, carried_over, escape_directions
 from dt_viz.avoidance.lift import Lift
@@ -187,7 +187,7 @@ class WholeArm:
         clearance = clearance.reshape(len(parts), len(q))
         near: Mask = clearance < margin
         for part, mask in zip(parts, near, strict=True):
-            mask[mask] = self.clearance(q[mask], part, margin, margin - ROUNDING) < margin
+            mask[mask] = self.clearance(q[mask], part, margin, margin - MARGIN_TOLERANCE) < margin
 
         def escapes(which: Indices) -> list[Array]:
             """Directions that leave all of these obstacles."""

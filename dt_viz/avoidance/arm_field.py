@@ -27,10 +27,8 @@ from dt_viz.robot.robot import Robot
 DIFFERENCE = 1e-4
 """Step of the finite differences for the slope of an obstacle's distance, metres."""
 
-LIMIT_ZONE = 0.05
-"""Width of the zone before a joint limit in which joints are held back, rad."""
 NEAREST_TO_LIMIT = 0.9
-"""Part of that zone that a planned path may use."""
+"""Part of the zone before a joint limit that a planned path may use."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +167,7 @@ class JointLimits(Diffeomorphism):
     """(n,) rad, −inf for continuous joints."""
     upper: Array
     """(n,) rad, +inf for continuous joints."""
-    zone: float = LIMIT_ZONE
+    zone: float = 0.05
     """m, rad."""
     fraction: float = 1.0
     """Part s of that time: (e/m)² becomes s·(e/m)² in both formulas; less than 1 holds no joint inside its limits."""

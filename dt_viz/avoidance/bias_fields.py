@@ -18,7 +18,6 @@ NUM_SAMPLES = 400
 KERNEL_WIDTH = 0.4
 """Kernel width of the regression, in radii; about the size of the core in which it smooths the unit vectors, which are
 singular at the target."""
-REGULARISATION = 1e-3
 
 
 @dataclass(frozen=True)
@@ -71,5 +70,5 @@ def unit_field(dim: int) -> RegionField:
     grid = GaussianGrid.covering(np.stack([-np.ones(dim), np.ones(dim)]), KERNEL_WIDTH, pad=0)
     features = grid.features(samples)
     gram = features.T @ features / len(samples)
-    gram[np.diag_indices_from(gram)] += REGULARISATION
+    gram[np.diag_indices_from(gram)] += 1e-3  # the ridge
     return RegionField(GridRBF(grid, cho_solve(cho_factor(gram), features.T @ away / len(samples))))

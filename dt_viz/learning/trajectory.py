@@ -17,8 +17,6 @@ from dt_viz.flows.fields import Array
 from dt_viz.learning.flow_chain import FlowChain
 from dt_viz.numerics import unit
 
-IMAGE_PRIOR = 1e-7  # damping of the images of the rays' ends, which could otherwise drift
-
 
 @dataclass(frozen=True)
 class TrajectoryFit:
@@ -83,7 +81,8 @@ class TrajectoryFit:
             before, accepted = cost, False
             for _ in range(12):
                 extra = damping * self.regularisation
-                step = system.solve(gradient, self.regularisation + extra, IMAGE_PRIOR + extra)
+                # without any damping the images of the rays' ends could drift
+                step = system.solve(gradient, self.regularisation + extra, 1e-7 + extra)
                 if step is None:
                     damping *= 8
                     continue
