@@ -153,13 +153,9 @@ class OnPlaces(Diffeomorphism):
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         d = self.transform.dim
-        place, rest = s[:, :d], s[:, d:]
-        if U is None:
-            image = self.transform.inverse(place) if inverse else self.transform.forward(place)
-            return np.concatenate([image, rest], axis=1), None
-        tangents = self.transform.inverse_tangents if inverse else self.transform.forward_tangents
-        image, V = tangents(place, U[:, :d])
-        return np.concatenate([image, rest], axis=1), np.concatenate([V, U[:, d:]], axis=1)
+        image, V = self.transform._map(s[:, :d], None if U is None else U[:, :d], inverse=inverse)
+        image = np.concatenate([image, s[:, d:]], axis=1)
+        return image, None if U is None or V is None else np.concatenate([V, U[:, d:]], axis=1)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
