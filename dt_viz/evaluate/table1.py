@@ -181,8 +181,8 @@ def _measure(fitted: Fitted, swept: Swept, methods: Sequence[Method], options: a
             first_motions[method.title] = curves(path, problem.task.paths[0], places[0].obstacle)
             print(f"{method.title}, {problem.task.title}: {arrays['seconds'].sum():.0f} s of planning", flush=True)
             write_json(folder / "table1.json", table)
-        print(f"\n{problem.task.title}: mean (worst) [paper]; lengths in mm")
-        report([_row(method.title, table[method.name][name]) for method in methods])
+        print("\nmean (worst) [paper]; lengths in mm")
+        report([_row(method.title, problem.task.title, table[method.name][name]) for method in methods])
         if draws:
             files = (folder / f"figure6_{name}.{suffix}" for suffix in ("svg", "png"))
             figures.save(figures.curves(problem.task.title, first_motions), *files)
@@ -356,10 +356,10 @@ def cells(method: str, task: str, arrays: Mapping[str, Array]) -> dict[str, dict
     return found
 
 
-def _row(title: str, cells: Mapping[str, Mapping[str, float | None]]) -> Row:
-    """Row of a method in the printed table."""
+def _row(title: str, task: str, cells: Mapping[str, Mapping[str, float | None]]) -> Row:
+    """Row of a method and a task, by their titles, in the printed table."""
     names = {column: f"{column} {UNITS[column][1]}" if column in UNITS else column for column in COLUMNS}
-    return {"method": title, **{names[column]: _cell(column, cells[column]) for column in COLUMNS}}
+    return {"method": title, "task": task, **{names[column]: _cell(column, cells[column]) for column in COLUMNS}}
 
 
 def _cell(column: str, cell: Mapping[str, float | None]) -> str:

@@ -23,6 +23,7 @@ NAMES = (
     "soak",
     "capacity",
     "webassembly",
+    "documents",
 )
 PROG = "python -m tests.benchmarks"
 

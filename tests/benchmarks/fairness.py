@@ -5,8 +5,9 @@
 The server is a process of its own, and both speak viser's protocol from this one. The first visitor drags a sphere 20
 times a second; he does so alone, beside the other one, alone and so on, as a machine is not as fast all the time. The
 other one learns (opens demonstrations of his own and learns them, again and again), uploads (a mesh of 300,000 faces
-every 4 s), or drags one of five obstacles before the whole arm. A gap is the time from one picture to the next. Figures
-are medians over the rounds, and a ratio is that of a figure beside the other one and its mean of just before and after.
+every 4 s), drags one of five obstacles before the whole arm, or saves the scene (as SVG, PDF and HTML in turn). A gap
+is the time from one picture to the next. Figures are medians over the rounds, and a ratio is that of a figure beside
+the other one and its mean of just before and after.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from collections.abc import Callable, Coroutine, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO
-from itertools import count, pairwise
+from itertools import count, cycle, pairwise
 from typing import Any
 from zipfile import ZipFile
 
@@ -30,6 +31,8 @@ from dt_viz.evaluate.visit import SETTINGS, Visit, places_of
 from dt_viz.flows.fields import Array
 from dt_viz.scenario.scenario import MAX_OBSTACLES
 from dt_viz.scenario.tasks import TASKS
+from dt_viz.ui.tabs.picture import SAVE_PICTURE
+from dt_viz.ui.tabs.saving import CANCEL
 
 OUT = TABLES
 
@@ -126,7 +129,7 @@ class Other:
 
     def __init__(self, client: ProtocolClient) -> None:
         self.client, self.num_done = client, 0
-        """His connection, and how often he has begun anew: to learn, to upload, or a lap of his drag."""
+        """His connection, and how often he has begun to learn or upload, or has ended a lap of his drag or a file."""
 
     async def learn(self) -> None:
         """Open demonstrations of his own and learn them, again and again."""
@@ -167,11 +170,22 @@ class Other:
             await Visit(self.client).drag(places_of(TASKS[OTHER.task](), lap, num_edits))
             self.num_done += 1
 
+    async def save(self) -> None:
+        """Save the scene in each format that the server makes, again and again."""
+        button = self.client.controls[self.client.find(SAVE_PICTURE)]
+        for suffix in cycle(("SVG", "PDF", "HTML")):
+            await self.client.set("Save as", suffix)
+            await self.client.set(SAVE_PICTURE, True)
+            for label in (CANCEL, SAVE_PICTURE):
+                await self.client.wait_for(lambda label=label: button["label"] == label, SETTINGS.patience)
+            self.num_done += 1
+
 
 DOINGS: Mapping[str, Callable[[Other], Coroutine[Any, Any, None]]] = {
     "learns": Other.learn,
     "uploads": Other.upload,
     "drags": Other.drag,
+    "saves": Other.save,
 }
 """What the other one does, by its name on the command line."""
 

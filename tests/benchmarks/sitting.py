@@ -54,10 +54,15 @@ SUBJECTS: Mapping[str, Subject] = {
     ),
     "load": Subject(
         "Visitors at once",
-        ("load --visitors 1 4 8 --seconds 20", "load --task push_box --rest --visitors 1 --seconds 40"),
+        (
+            "load --visitors 1 4 8 --seconds 20",
+            "load --visitors 40 --lecture --after 40 --seconds 20",
+            "load --rest --visitors 4 --seconds 15 --after 10",
+            "load --present --visitors 50 --seconds 10 --after 8",
+        ),
         ".json",
     ),
-    "fairness": Subject("Beside somebody who takes all that he can get", ("fairness",), ".json"),
+    "fairness": Subject("Beside somebody who takes all that he can get", ("fairness --rounds 3",), ".json"),
     "scenes": Subject("Scenes of the paper", ("scenes",), ".json"),
     "exactness": Subject(
         "Exact rollouts",
@@ -67,23 +72,21 @@ SUBJECTS: Mapping[str, Subject] = {
     "reactive": Subject(
         "The robot in the loop",
         (
-            *_for_tasks("reactive --task {} --speed 0.2 --runs 10 --seed 201"),
-            *_for_tasks("reactive --task {} --speed 0.5 --runs 10 --seed 201"),
-            *_for_tasks("reactive --task {} --speed 1.0 --runs 20 --seed 201"),
-            *_for_tasks("reactive --task {} --speed 1.0 --runs 20 --obstacles 2 --seed 102"),
-            *_for_tasks("reactive --task {} --speed 1.0 --runs 20 --boxes --seed 103"),
+            *_for_tasks("reactive --task {} --speed 0.2 --runs 10 --seed 201 --jobs 2"),
+            *_for_tasks("reactive --task {} --speed 0.5 --runs 20 --seed 201 --jobs 2"),
+            *_for_tasks("reactive --task {} --speed 1.0 --runs 20 --seed 901 --jobs 2"),
+            *_for_tasks("reactive --task {} --speed 1.0 --runs 20 --obstacles 2 --seed 102 --jobs 2"),
+            *_for_tasks("reactive --task {} --speed 1.0 --runs 20 --boxes --seed 103 --jobs 2"),
         ),
         ".npz",
     ),
     "imitation": Subject(
         "Learning",
         (
-            "imitation assets/lift_box.npz assets/push_box.npz --leave-one-out",
-            "imitation assets/lift_box.npz assets/push_box.npz --state augmented --leave-one-out",
-            "imitation LASA --leave-one-out",
-            "imitation LASA --state augmented --leave-one-out",
-            "imitation LASA --state auto --leave-one-out",
-            "imitation LASA --objective velocity",
+            "imitation LASA --leave-one-out --jobs 2",
+            "imitation LASA --state augmented --leave-one-out --jobs 2",
+            "imitation LASA --state auto --leave-one-out --jobs 2",
+            "imitation LASA --objective velocity --jobs 2",
         ),
         "",
     ),
@@ -91,12 +94,12 @@ SUBJECTS: Mapping[str, Subject] = {
     "around": Subject(
         "Avoidance",
         (
-            "around --task draw_s --obstacle -0.004,-0.5,0.412 --space task",
-            "around --task draw_s --obstacle -0.004,-0.5,0.412 --space task --no-avoidance",
-            *_for_tasks("around --task {} --count 20 --seed 0"),
-            *_for_tasks("around --task {} --count 11 --along 0,1 --shape any --size 0.06,0.25 --seed 2"),
-            *_for_tasks("around --task {} --count 6 --along 0,1 --shape any --size 0.06,0.25 --number 2 --seed 7"),
-            *_for_tasks("around --task {} --count 12 --along 0,1 --shape any --size 0.06,0.25 --seed 2 --space task"),
+            *_for_tasks("around --task {} --count 20 --seed 0 --jobs 2"),
+            *_for_tasks("around --task {} --count 11 --along 0,1 --shape any --size 0.06,0.25 --seed 2 --jobs 2"),
+            *_for_tasks(
+                "around --task {} --count 6 --along 0,1 --shape any --size 0.06,0.25 --number 2 --seed 7 --jobs 2"
+            ),
+            *_for_tasks("around --task {} --count 20 --along 0,1 --shape any --size 0.06,0.25 --seed 2 --space task"),
         ),
         ".npz",
         11,
@@ -108,7 +111,7 @@ SUBJECTS: Mapping[str, Subject] = {
         1,
     ),
     "arms": Subject("Other arms", ("arms --count 10 --seed 7",), ".npz"),
-    "table1": Subject("The paper's comparison", ("table1 --perturbed 60",), ""),
+    "table1": Subject("The paper's comparison", ("table1 --perturbed 60 --jobs 2",), ""),
 }
 
 
@@ -150,7 +153,7 @@ def measured(name: str, subject: Subject, out: Path, files: Sequence[Path]) -> i
         return 0
     machine = {"cores": os.cpu_count(), "machine": platform.machine(), "python": platform.python_version()}
     table = {"title": subject.title, "date": date.today().isoformat(), **machine, "results": results}
-    path = out / f"{table['date']}-{name}"
+    path = out / name
     path.with_suffix(".json").write_text(json.dumps(table, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
     path.with_suffix(".md").write_text(markdown(table), encoding="utf-8")
     print(f"{path}.md after {time.monotonic() - began:.0f} s", flush=True)

@@ -90,8 +90,8 @@ def test_the_paper_stands_beside_what_is_known_of_it(table):
 def test_the_printed_row_has_mean_worst_and_paper(table):
     cells = {column: {"mean": 0.1, "worst": 0.2, "paper": None} for column in table1.COLUMNS}
     cells["frechet"]["paper"] = 0.124
-    row = table1._row("Ours", cells)
-    assert (row["method"], row["frechet"], row["turn °"]) == ("Ours", "100 (200) [124]", "0 (0)")
+    row = table1._row("Ours", "Draw S", cells)
+    assert (row["method"], row["task"], row["frechet"], row["turn °"]) == ("Ours", "Draw S", "100 (200) [124]", "0 (0)")
 
 
 def test_imitation_alone_is_nearer_and_deeper_than_a_straight_line(table):
