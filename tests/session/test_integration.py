@@ -1,6 +1,7 @@
 """Integrators chosen by hand: what they cost is measured and said, and nothing is said where they cost nothing."""
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -69,6 +70,8 @@ def test_a_fold_of_what_is_drawn_is_found_where_there_is_none_on_the_way_back():
     chain, ends = Chain([inner, flow, outer]), (outer.inverse(y), inner.forward(x))
     assert fold_warnings("It", chain, coarse, ends[0][missed], ends[1][missed])
     assert fold_warnings("It", chain, coarse, ends[0][fine], ends[1][fine]) == ()
+    unasked = Mock(dim=3, side_effect=AssertionError)  # the field of a flow without equal steps
+    assert fold_warnings("It", Flow.adaptive(unasked, 1.0), coarse, y, x) == ()
 
 
 def certified(engine, scenario):
