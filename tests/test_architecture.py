@@ -38,7 +38,8 @@ MAY_IMPORT: Mapping[str, set[str]] = {
     "ui": BELOW_SESSION | {"kernels", "session", "baselines", "serving", "saving"},
     "evaluate": BELOW_SESSION | {"session", "baselines"},
     "examples": {"foundation"},
-    "picture": BELOW_SESSION | {"saving", "session", "ui"},
+    "picture_making": BELOW_SESSION | {"saving", "session", "ui"},
+    "picture": {"picture_making"},
     "cli": BELOW_SESSION | {"session", "serving", "ui", "evaluate", "saving", "picture"},
     "__main__": {"cli"},
 }
@@ -139,7 +140,9 @@ def test_only_the_page_talks_to_the_browser():
 
 
 def test_what_viser_keeps_to_itself_is_used_in_one_file():
-    private = re.compile(r"viser\._(?!_)|\._impl\b|\._queue_update\b|\._websock|websockets\.asyncio\.server\.serve")
+    private = re.compile(
+        r"viser\._(?!_)|\._impl\b|\._queue_update\b|\._websock|websockets\.asyncio\.server\.serve|:has\(|mantine-[A-Z]"
+    )
     page = [path for path in SOURCES if path.parent in {PACKAGE / "ui", PACKAGE / "ui" / "tabs"}]
     assert [path.name for path in page if private.search(path.read_text(encoding="utf-8"))] == ["patches.py"]
 

@@ -9,7 +9,7 @@ from chromium import needs_chromium
 from PIL import Image
 
 from dt_viz.cli import main
-from dt_viz.picture import SETTINGS
+from dt_viz.picture_making import SETTINGS
 from dt_viz.scenario.own import Own
 from dt_viz.scenario.saved import Saved, encode
 from dt_viz.scenario.scenario import Scenario
@@ -63,7 +63,7 @@ def test_a_browser_that_opens_nothing_is_given_up(does, said, capsys, tmp_path, 
     browser.write_text(f"#!/bin/sh\n{does}\n")
     browser.chmod(0o755)
     monkeypatch.setenv(SETTINGS.variable, str(browser))
-    monkeypatch.setattr("dt_viz.picture.SETTINGS", type(SETTINGS)(patience=0.5))
+    monkeypatch.setattr("dt_viz.picture_making.SETTINGS", type(SETTINGS)(patience=0.5))
     assert main(["picture", "draw_s", "--out", str(tmp_path / "f.png")]) == 2
     assert said in capsys.readouterr().err
     assert [*tmp_path.iterdir()] == [browser]
@@ -85,7 +85,7 @@ def test_a_saved_scenario_is_recorded_with_its_demonstrations_its_arm_and_its_ca
     monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
     made, recorded, engine = [], [], ArmStore.engine
     monkeypatch.setattr(ArmStore, "engine", lambda store, name: made.append(name) or engine(store))
-    monkeypatch.setattr("dt_viz.ui.scene.recording.record", lambda *given: recorded.append(given) or b"page")
+    monkeypatch.setattr("dt_viz.picture_making.record", lambda *given: recorded.append(given) or b"page")
     own, sight = own_task(TASKS["push_box"]().demonstrations[:3]), ((0.4, -2.2, 1.4), (0.2, -0.3, 0.2))
     text = encode(Saved(Scenario(OWN, (), arm="panda"), sight, Own.of(own)))
     (tmp_path / "a.json").write_text(text)

@@ -13,7 +13,7 @@ from dt_viz.evaluate import THREADS
 
 BAD_INPUT = 2
 """Exit status for what the user can put right; argparse uses the same."""
-COMMANDS = ("imitation", "around", "reactive", "arms", "table1", "train", "load")
+COMMANDS = ("imitation", "around", "reactive", "table1", "train", "load")
 FORMER: Mapping[str, tuple[str, ...]] = {
     "avoidance": ("around", "--space", "task"),
     "places": ("around",),
@@ -21,7 +21,7 @@ FORMER: Mapping[str, tuple[str, ...]] = {
 }
 """Former names of commands, and the arguments that they stand for."""
 MOVED: Mapping[str, str] = {
-    **{name: name for name in ("drag", "latency", "pictures", "scenes")},
+    **{name: name for name in ("arms", "drag", "latency", "pictures", "scenes")},
     **dict.fromkeys(("rollouts", "starts", "velocity"), "exactness"),
 }
 """Former commands that are for developers now, and the benchmark that each belongs to."""

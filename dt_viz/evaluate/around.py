@@ -44,7 +44,6 @@ from dt_viz.evaluate.held_out import frechet
 from dt_viz.evaluate.options import (
     Row,
     add_task,
-    avoiding,
     chosen_task,
     engine_of,
     interval,
@@ -64,6 +63,7 @@ from dt_viz.obstacles.occupancy import GENERATORS
 from dt_viz.obstacles.shapes import UPRIGHT, Box, Cylinder, Obstacle, Quaternion, Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.inverse_kinematics import UnreachableError
+from dt_viz.scenario.stack import avoiding
 from dt_viz.scenario.tasks import Task
 from dt_viz.session.engine import ArmMotion, Engine
 from dt_viz.warning import Kind, MotionWarning

@@ -204,9 +204,6 @@ class _Role(Enum):
     LOOK_ON = auto()
 
 
-DRAGS = (_Role.DRAG, _Role.DRAG_IN_BURSTS)
-
-
 def roles_of(options: argparse.Namespace, number: int) -> list[_Role]:
     """Return what each of so many visitors does: in a lecture at random, as processes take visitors in turn."""
     if not options.lecture:

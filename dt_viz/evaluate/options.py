@@ -13,13 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from dt_viz.avoidance.hand import Avoidance
-from dt_viz.avoidance.registry import AVOIDANCE
 from dt_viz.errors import FormatError
 from dt_viz.folders import default_cache_folder
 from dt_viz.learning.store import FitStore
 from dt_viz.robot.models import load_arm
-from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.tasks import TASKS, Task, TaskEntry, known_tasks
 from dt_viz.session.engine import Engine
 from dt_viz.session.tasks_in_reach import in_reach
@@ -72,11 +69,6 @@ def new_engine(tasks: Mapping[str, TaskEntry], arm: str = "jaco") -> Engine:
 def engine_of(task: Task) -> Engine:
     """Return a new engine with one task."""
     return new_engine({task.name: TaskEntry(task.title, lambda: task)})
-
-
-def avoiding(task: Task, avoidance: Avoidance, *, on: bool = True) -> Scenario:
-    """Return the scenario of a task with an avoidance, switched on or off, on its imitation."""
-    return Scenario(task.name, (Layer(avoidance, on, AVOIDANCE.title),))
 
 
 def whole_number(minimum: int, maximum: int | None = None) -> Callable[[str], int]:

@@ -27,6 +27,8 @@ from numpy.typing import ArrayLike
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
+from dt_viz.obstacles.shapes import UPRIGHT
+
 ROLLOUT, OBSTACLE = "/rollouts/followed", "/obstacles/0"
 """Names of the tube of the rollout that the arm follows and of the first obstacle's gizmo in the scene tree."""
 ANSWERED = "/obstacles/answered"
@@ -37,7 +39,6 @@ MAX_MESSAGE = 64 * 2**20
 """Largest size of a message from the server, bytes."""
 PART = 512 * 1024
 """Size of a part of a file, bytes, as in viser's own page."""
-UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
 
 class LostError(ConnectionError):

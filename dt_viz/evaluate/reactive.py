@@ -31,7 +31,6 @@ from dt_viz.evaluate.options import (
     Row,
     add_task,
     as_text,
-    avoiding,
     chosen_task,
     engine_of,
     positive_number,
@@ -44,6 +43,7 @@ from dt_viz.flows.fields import Array
 from dt_viz.metrics import arc_length, interpolate, resample_by_arc_length
 from dt_viz.motion.stack import LIVE
 from dt_viz.obstacles.shapes import UPRIGHT, Box, Obstacle, Quaternion, Sphere, as_point, as_quaternion
+from dt_viz.scenario.stack import avoiding
 from dt_viz.scenario.tasks import Task
 from dt_viz.session.engine import Engine
 

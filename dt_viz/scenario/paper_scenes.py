@@ -12,7 +12,7 @@ import numpy as np
 
 from dt_viz.avoidance.avoidance import ArmAvoidance, Avoidance
 from dt_viz.avoidance.bias import BiasPoint
-from dt_viz.avoidance.registry import AVOIDANCE, BIAS
+from dt_viz.avoidance.registry import BIAS
 from dt_viz.flows.fields import Array, Mask
 from dt_viz.obstacles.clouds import Cloud
 from dt_viz.obstacles.occupancy import sample_labels
@@ -21,8 +21,8 @@ from dt_viz.obstacles.solids import Solid
 from dt_viz.obstacles.surfaces import lathe
 from dt_viz.scenario.objects import Pot
 from dt_viz.scenario.panels import BASE_PANEL, Panel
-from dt_viz.scenario.scenario import Layer, Scenario, View
-from dt_viz.scenario.stack import IMITATION, plane_of, with_added
+from dt_viz.scenario.scenario import Scenario, View
+from dt_viz.scenario.stack import IMITATION, avoiding, plane_of, with_added
 from dt_viz.scenario.tasks import Task
 
 OTHER_LETTERS = tuple(f"draw_{letter}" for letter in "cgjwz")
@@ -41,8 +41,6 @@ FIG_6_PLACES: Mapping[str, Point] = {
     "draw_s": (0.0688, -0.4549, 0.3857),
 }
 """Places of the sphere of fig. 6, for each task: the first at which `evaluate table1` measures, metres."""
-FIG_6_DIAMETER = 0.15
-"""Its diameter, metres."""
 FIG_6 = {"compared": ("eflow-repulsive", "linear", "modulation"), "field": False, "ghost": False}
 """View of its scenes: the methods that follow a drag, one of each kind."""
 FIRST_BIAS = f"{BIAS.title} 1"
@@ -80,10 +78,6 @@ class PaperScene:
         return scenario.choices != replace(self.scenario(task), **free).choices
 
 
-def _avoiding(task: Task, avoidance: Avoidance) -> Scenario:
-    return Scenario(task.name, (Layer(avoidance, name=AVOIDANCE.title),))
-
-
 def _biased(task: Task, *points: BiasPoint) -> Scenario:
     scenario = Scenario(task.name)
     for point in points:
@@ -106,21 +100,19 @@ def _bottle_in_the_way(task: Task) -> Scenario:
     """Fig. 1 and 7: a standing bottle in the path, given way to by the whole arm."""
     beside_the_box = {"lift_box": 34, "push_box": 55}  # percent of the motion's length
     x, y, _ = task.mean_path[beside_the_box[task.name]]
-    return _avoiding(task, ArmAvoidance(MeshObstacle((float(x), float(y), 0.0), bottle(), scale=task.size)))
+    return avoiding(task, ArmAvoidance(MeshObstacle((float(x), float(y), 0.0), bottle(), scale=task.size)))
 
 
 def _sphere_in_the_letter(diameter: float) -> Callable[[Task], Scenario]:
     """Return what makes the scenario of fig. 2."""
-    return lambda task: _avoiding(
-        task, Avoidance(Sphere(task.obstacle_position, task.size * diameter), plane=plane_of(task))
-    )
+    return lambda task: avoiding(task, Avoidance(task.sphere(diameter), plane=plane_of(task)))
 
 
 def _cube_before_the_attractor(task: Task) -> Scenario:
     """Fig. 3 (a): motions that are straight but for a cube of 10 cm."""
     middle, side = (task.starts.mean(axis=0) + task.mean_path[-1]) / 2, 0.10 * task.size
     cube = Box(as_point(middle), (side, side, side))
-    return replace(_avoiding(task, Avoidance(cube, plane=plane_of(task))), imitation=False)
+    return replace(avoiding(task, Avoidance(cube, plane=plane_of(task))), imitation=False)
 
 
 def _alone(task: Task) -> Scenario:
@@ -169,7 +161,7 @@ CLOVER = Clover()
 
 def _cloud_in_the_letter(task: Task) -> Scenario:
     """Sec. 4.4."""
-    return _avoiding(task, Avoidance(CloudObstacle(task.obstacle_position, CLOVER.cloud, scale=task.size)))
+    return avoiding(task, Avoidance(CloudObstacle(task.obstacle_position, CLOVER.cloud, scale=task.size)))
 
 
 def _two_points(task: Task) -> Scenario:
@@ -189,10 +181,8 @@ def release(pot: Pot) -> Point:
 def _comparison(name: str, title: str, task: str) -> PaperScene:
     """Return a scene of ours beside other methods (fig. 6)."""
     line = "Ours is orange. Scores and curves of all are in “Compare”; drag the sphere."
-    avoidance = ArmAvoidance(Sphere(FIG_6_PLACES[task], FIG_6_DIAMETER))
-    return PaperScene(
-        name, f"Fig. 6: {title}", line, task, lambda task: _avoiding(task, avoidance), FIG_6, of_jaco=True
-    )
+    avoidance = ArmAvoidance(Sphere(FIG_6_PLACES[task]))
+    return PaperScene(name, f"Fig. 6: {title}", line, task, lambda task: avoiding(task, avoidance), FIG_6, of_jaco=True)
 
 
 def _into_pot(name: str, index: int) -> PaperScene:

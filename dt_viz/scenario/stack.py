@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from dt_viz.avoidance.avoidance import Space
+from dt_viz.avoidance.avoidance import Avoidance, Space
 from dt_viz.avoidance.page import Surroundings
 from dt_viz.avoidance.registry import AVOIDANCE, entry_of
 from dt_viz.avoidance.transform import Anchored, Transform
@@ -21,6 +21,11 @@ IMITATION, WHOLE_ARM = "Imitation", "Whole arm"
 """Names of the transforms below and above the stack: the learned one, and the avoidance in configuration space."""
 
 Stack = tuple[Layer, ...]
+
+
+def avoiding(task: Task, avoidance: Avoidance, *, on: bool = True) -> Scenario:
+    """Return the scenario of a task with an avoidance, switched on or off, on its imitation."""
+    return Scenario(task.name, (Layer(avoidance, on, AVOIDANCE.title),))
 
 
 def place_of(scenario: Scenario, name: str) -> int | None:

@@ -17,7 +17,7 @@ from dt_viz.learning.inspection import PreparationSettings
 from dt_viz.learning.interface import AnyImitation, State
 from dt_viz.metrics import resample_by_arc_length
 from dt_viz.numerics import unit
-from dt_viz.obstacles.shapes import Point, as_point
+from dt_viz.obstacles.shapes import Point, Sphere, as_point
 from dt_viz.scenario.objects import Ball, LiftedBox, Pot, PushedBox, TaskObject
 from dt_viz.scenario.scenario import Layer
 from dt_viz.scenario.slices import Slice
@@ -88,6 +88,10 @@ class Task:
     """Transforms that it begins with, in the frame of the demonstrations; without any it is a sphere to avoid."""
     lesson: Lesson | None = None
     """What a visitor has taught for it in the page; None if that was nothing."""
+
+    def sphere(self, diameter: float = Sphere.diameter) -> Sphere:
+        """Return the sphere in the way of the motions, of a diameter in metres where the task has its own size."""
+        return Sphere(self.obstacle_position, self.size * diameter)
 
     def to_world(self, points: Array) -> Array:
         """Transform points (*B, k) of the demonstrations to the world, (*B, 3), metres."""

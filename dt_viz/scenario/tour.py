@@ -10,16 +10,13 @@ import numpy as np
 
 from dt_viz.avoidance.avoidance import ArmAvoidance, Avoidance
 from dt_viz.avoidance.bias import BiasPoint
-from dt_viz.avoidance.registry import AVOIDANCE
-from dt_viz.obstacles.shapes import Sphere, as_point
-from dt_viz.scenario.scenario import Layer, Scenario, Start, View
-from dt_viz.scenario.stack import plane_of, with_added
+from dt_viz.obstacles.shapes import as_point
+from dt_viz.scenario.scenario import Scenario, Start, View
+from dt_viz.scenario.stack import avoiding, plane_of, with_added
 from dt_viz.scenario.tasks import Task
 
 TASK = "draw_s"
 """Name of the task of all steps."""
-DIAMETER = 0.15
-"""Diameter of the sphere, metres."""
 BIAS_AT, BIAS_OFFSET = 20, (-0.05, 0.04)
 """Percent of the mean demonstration's length beside which the bias point lies, and how far, right and up, metres."""
 NEW_STARTS = ((-0.9, 0.6), (-0.3, -0.9), (0.4, 0.9), (0.9, 0.2))
@@ -66,25 +63,17 @@ def _from_elsewhere(task: Task) -> Scenario:
 
 
 def _hand_avoids(task: Task) -> Scenario:
-    return _avoiding(task, Avoidance(_sphere(task), plane=plane_of(task)))
+    return avoiding(task, Avoidance(task.sphere(), plane=plane_of(task)))
 
 
 def _arm_avoids(task: Task) -> Scenario:
-    return _avoiding(task, ArmAvoidance(_sphere(task)))
+    return avoiding(task, ArmAvoidance(task.sphere()))
 
 
 def _all_at_once(task: Task) -> Scenario:
     scenario = _arm_avoids(task)
     place = task.mean_path[BIAS_AT] + task.size * task.slice.axes @ BIAS_OFFSET
     return replace(scenario, stack=with_added(scenario, BiasPoint(as_point(place), plane=plane_of(task)))[0])
-
-
-def _sphere(task: Task) -> Sphere:
-    return Sphere(task.obstacle_position, task.size * DIAMETER)
-
-
-def _avoiding(task: Task, avoidance: Avoidance) -> Scenario:
-    return Scenario(task.name, (Layer(avoidance, name=AVOIDANCE.title),))
 
 
 STEPS = (

@@ -65,7 +65,7 @@ class Progress:
     """Whether the last work ended by an error, so that what is wanted may never be shown."""
     message: Message | None = None
     restored: Scenario | None = None
-    """The scenario that was found in the browser; None if none was."""
+    """The saved scenario that the page began or went on with, of the browser, a file or the server; None if none."""
     steps: tuple[bool, bool] = (False, False)
     """Whether there is something to undo, and to redo."""
     beside: tuple[bool, bool] | None = None

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
+from types import MappingProxyType
 from typing import Any
 
 import viser
@@ -21,14 +22,13 @@ from dt_viz.scenario.tasks import Task
 from dt_viz.session.frame import Frame
 from dt_viz.session.progress import Progress
 from dt_viz.session.session import CHOICES, Session
+from dt_viz.ui import patches
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.controls import Control
 from dt_viz.ui.keeping import Storage
 from dt_viz.ui.pen import Pen
-from dt_viz.ui.playback import Playback
 from dt_viz.ui.scene.camera import CameraController, Pose
 from dt_viz.ui.scene.figure import render_figure
-from dt_viz.ui.scene.legend import Legend
 from dt_viz.ui.scene.palette import Colour
 from dt_viz.ui.scripts import Link
 from dt_viz.ui.tabs.about import Command, add_about, add_commands, numbered
@@ -50,15 +50,6 @@ MAX_UPLOAD = 50 * 10**6
 """Largest number of bytes of what a visitor sends."""
 NO_SCENE = "–"
 OFF = "Off"
-STYLE = """<style>
-[data-dock-tab] { padding: 0 0.45em !important; }
-@media (max-width: 36em) {
-    .mantine-Paper-root:has([role="status"]), .mantine-ScrollArea-content > div:has([role="status"]) {
-        width: 100% !important;
-    }
-}
-</style>"""
-"""Style of the panel: all tabs lie in one row, and on a phone it is as wide as the window."""
 SAVE_HINT = "Save: all that you have made, your own demonstrations too, as a file; “Open a file” goes on with it"
 SPACES: Mapping[str, Space] = {"Hand": "task", "Arm": "cspace"}
 """Spaces of the avoidance, by their names on the page."""
@@ -87,6 +78,7 @@ class ControlPanel:
         pen: Pen | None = None,
         storage: Storage | None = None,
         came_back: Callable[[Pose | None], None] = lambda _pose: None,
+        scenarios: Mapping[str, Callable[[], None]] = MappingProxyType({}),
     ) -> None:
         """Build the controls, for the titles of tasks and arms by name; they act once `connect` has given a session.
 
@@ -94,9 +86,9 @@ class ControlPanel:
         `save` sends the scenario as a file and must only submit, `record` makes a page that replays what is shown,
         `film` a video. `open_scenario` goes on with the scenario of a file if it holds one. A visitor teaches with the
         `pen`. The browser's `storage` keeps where the visitor is in the tour, at whose end `came_back` is called; see
-        `Tour`.
+        `Tour`. A link may name one of the `scenarios`, which begin when they are called.
         """
-        self._notify, self._titles = notify, dict(titles)
+        self._notify, self._titles, self._scenarios = notify, dict(titles), scenarios
         self._scenes = {scene.title: scene for scene in offered(self._titles)}
         self.bindings = bindings = Bindings()
         self.presentation = Presentation(gui, self._turn, lambda alone: tripod.reframe(alone=alone))
@@ -115,7 +107,7 @@ class ControlPanel:
         travels = {"Undo": Session.undo, "Redo": Session.redo, "Reset": reset, "Save": save}
         buttons = gui.add_button_group("History", tuple(travels), hint=SAVE_HINT)
         bindings.on(buttons, lambda session, button: travels[button](session))
-        gui.add_html(STYLE)
+        gui.add_html(patches.PANEL)
         tabs = gui.add_tab_group()
         with tabs.add_tab("World"):
             loader = add_obstacles(gui, bindings)
@@ -129,7 +121,7 @@ class ControlPanel:
             add_arm(gui, bindings, arms, self.begin, lambda session: self.show.timeline.show(session, PAST))
             add_joints(gui, bindings, send)
         with tabs.add_tab("Compare"):
-            self._compare = ComparePanel(gui, bindings, send)
+            ComparePanel(gui, bindings, send)
         with tabs.add_tab("Picture"):
             act = {"darken": darken, "enlarge": enlarge, "render": render, "draw": self._draw, "record": record}
             picture = PictureTab(gui, bindings, tripod, self.presentation, film=film, send=send, **act)
@@ -150,18 +142,9 @@ class ControlPanel:
         self.bindings.connect(session)
 
     @property
-    def legend(self) -> Legend | None:
-        """Legend of the colours on the slice."""
-        return self.show.legend
-
-    @property
     def headline(self) -> str:
         """Title and status of what is shown, as HTML."""
         return f"<h3 style='margin:0.4em 0.7em'>{self.presentation.title}</h3>{self.status.judgement}"
-
-    def pose(self, playback: Playback) -> None:
-        """Show what a playback shows now on the timeline; called by its thread."""
-        self.show.timeline.follow(playback)
 
     def adopt(self, scenario: Scenario) -> None:
         """Show the scenario's choices."""
@@ -172,8 +155,7 @@ class ControlPanel:
         wanted = self.bindings.scenario
         if wanted is None or frame.scenario.begins_like(wanted):
             self.bindings.report(frame)
-            self.show.draw(frame)
-            self._compare.draw(frame.comparison)
+            self.show.plots.draw(frame)
 
     def tell(self, progress: Progress) -> None:
         """Show the verdict on what is shown, its hint, and a message, which is for a while beside the panel, too."""
@@ -266,19 +248,19 @@ class ControlPanel:
         else:
             session.say(f"“{title}” is made for the JACO: choose it in Arm → Model.", Severity.WARNING)
 
-    def follow(self, session: Session, link: Link, scenarios: Mapping[str, Callable[[], None]]) -> None:
+    def follow(self, session: Session, link: Link) -> None:
         """Begin the scene, the task, the tour or the scenario that a link asks for; where there is none, say so."""
         scene = found(link.name, self._scenes.values()) if link.kind == "scene" else None
         names = {"scene": [each.name for each in self._scenes.values()], "task": self._titles, "tour": NUMBERS}
-        names["scenario"] = scenarios
+        names["scenario"] = self._scenarios
         if scene is not None:
             self.begin(self._load, session, scene.title)
         elif link.kind == "task" and link.name in self._titles:
             self.begin(lambda session, _title: session.begin_task(link.name), session, self._titles[link.name])
         elif link.kind == "tour" and link.name in ("", *NUMBERS):
             self.tour.take(session, int(link.name or 1) - 1)
-        elif link.kind == "scenario" and link.name in scenarios:
-            scenarios[link.name]()
+        elif link.kind == "scenario" and link.name in self._scenarios:
+            self._scenarios[link.name]()
         else:
             accepted = ", ".join(names[link.kind])[:200] or "none: this server offers none"
             text = f"The link: {link.kind}: found {link.name!r}; accepted: {accepted}"

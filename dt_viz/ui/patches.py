@@ -1,6 +1,7 @@
 """What is used of viser and websockets beyond what they document, and changed in them; nothing else does either.
 
-Each function names the public hook that would replace it. What it needs is checked when the server starts.
+Each function names the public hook that would replace it. What it needs is checked when the server starts. Styles of
+elements of viser's page are HTML that is to stand on it; each would be replaced by an option of its elements.
 """
 
 from __future__ import annotations
@@ -27,6 +28,41 @@ import websockets.asyncio.server
 
 Options = Callable[[Any, dict[str, Any]], tuple[Any, dict[str, Any]]]
 """Function of a handler of connections and of options of `websockets.serve`, which returns others."""
+
+PANEL = """<style>
+[data-dock-tab] { padding: 0 0.45em !important; }
+@media (max-width: 36em) {
+    .mantine-Paper-root:has([role="status"]), .mantine-ScrollArea-content > div:has([role="status"]) {
+        width: 100% !important;
+    }
+}
+</style>"""
+"""Style of the panel: all tabs lie in one row, and on a phone it is as wide as the window."""
+ROW = (
+    "<style>div:has(> .dt-row) + div > div > :first-child { width: auto !important; }</style><div class='dt-row'></div>"
+)
+"""Mark and style of a group of buttons that needs the room beside its label to lie in one row."""
+ALONE = """<style>
+.mantine-Paper-root:has(.dt-caption) { visibility: hidden; }
+.dt-caption, div:has(> .dt-caption) + div { visibility: visible; position: fixed; bottom: 0; box-sizing: border-box; }
+.dt-caption {
+    left: 0; right: 0; padding: 2.2em 13em 1.2em 2.4em; pointer-events: none; color: var(--mantine-color-text);
+    background: linear-gradient(to top, var(--mantine-color-body) 35%, transparent);
+}
+.dt-caption h1 { margin: 0; font-size: clamp(1.5rem, 3.2vw, 4rem); line-height: 1.2; font-weight: 650; }
+.dt-caption p { margin: 0.2em 0 0; font-size: clamp(1rem, 1.7vw, 2.2rem); line-height: 1.3; }
+div:has(> .dt-caption) + div { right: 1em; width: 11.5em; padding: 0 0 1em; }
+div:has(> .dt-caption) + div label { display: none; }
+div:has(> .dt-caption) + div > div > :first-child { display: none; }
+@media (max-width: 700px) { .dt-caption { padding: 1.6em 1.2em 3.4em; } }
+</style>"""
+"""Style that hides the panel around the caption, and puts that and the buttons after it at the foot of the window."""
+AT_THE_FOOT = """<style>@media (max-width: 576px) {
+  div:has(> .mantine-Tabs-root .dt-timeline) {
+    position: sticky; bottom: 0; z-index: 1; background: var(--mantine-color-body);
+  }
+}</style><div class='dt-timeline'></div>"""
+"""Mark and style of a window that stays at the foot on a phone, where it is a part of the sheet."""
 
 
 class GateError(RuntimeError):
@@ -168,6 +204,13 @@ def put_back_pose(gizmo: viser.TransformControlsHandle, position: Any, wxyz: Any
     """
     gizmo._impl.position, gizmo._impl.wxyz = np.full(3, np.nan), np.full(4, np.nan)
     gizmo.position, gizmo.wxyz = position, wxyz
+
+
+def steps_html(steps: tuple[bool, bool]) -> str:
+    """Return what dims the first two of the buttons after it, Undo and Redo, where there is no such step."""
+    idle = (f"div:has(> .dt-steps) + div button:nth-of-type({k})" for k, step in enumerate(steps, start=1) if not step)
+    style = "".join(f"{button} {{ opacity: 0.35; pointer-events: none; }}" for button in idle)
+    return f"<style>{style}</style><div class='dt-steps'></div>"
 
 
 NUM_ENCODED = 16

@@ -24,7 +24,6 @@ import viser
 from dt_viz.ui import patches
 from dt_viz.ui.controls import Control
 from dt_viz.ui.origins import is_loopback
-from dt_viz.ui.panel import STYLE
 from dt_viz.ui.scene.camera import Framing, Pose, followed, window_size
 from dt_viz.ui.scripts import Ruler, forget_html
 from dt_viz.ui.visitor import Visitor
@@ -143,7 +142,7 @@ class Lecture:
             hint = "off: your own camera stays where you move it"
             box = client.gui.add_checkbox("Follow the presenter's camera", True, hint=hint)
             viewer.follow = Control(box, lambda _on: setattr(viewer, "seen", None))
-            viewer.qr = client.gui.add_html(f"{STYLE}{SMALL}{self._address_html(client)}</div>")
+            viewer.qr = client.gui.add_html(f"{patches.PANEL}{SMALL}{self._address_html(client)}</div>")
 
     def measured(self, token: str, width: float) -> None:
         """Take the width of a viewer's window, CSS pixels."""

@@ -17,14 +17,12 @@ from __future__ import annotations
 import html
 import re
 import secrets
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
 from urllib.parse import unquote
 
 import viser
 
-from dt_viz.scenario.saved import Saved
 from dt_viz.ui import patches
 
 FOLDER = "window"
@@ -186,9 +184,7 @@ Told = Callable[[str, "float | Link | Claim"], None]
 class Ruler:
     """Measures the window of one visitor, and reads its link."""
 
-    def __init__(self, scenarios: Mapping[str, Saved] = MappingProxyType({})) -> None:
-        """Make one whose link may name these scenarios."""
-        self.scenarios = scenarios
+    def __init__(self) -> None:
         self.token = secrets.token_urlsafe(12)
         """Name of this ruler in requests, which nobody else knows."""
 

@@ -16,7 +16,7 @@ import viser
 from dt_viz.accounts import Account
 from dt_viz.errors import Cancelled, DataError, FormatError, end_if, never
 from dt_viz.files.uploads import keep_ready, let_go
-from dt_viz.obstacles.shapes import Sphere, TriangleObstacle, as_point
+from dt_viz.obstacles.shapes import TriangleObstacle, as_point
 from dt_viz.pictures.video import check_installed
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.own import Own
@@ -69,8 +69,7 @@ def initial(task: Task) -> Scenario:
     scenario = Scenario(task.name)
     if task.layers:
         return replace(scenario, stack=in_world(task))
-    sphere = Sphere(task.obstacle_position, task.size * Sphere.diameter)
-    return replace(scenario, stack=with_avoidance(scenario, obstacles=(sphere,)))
+    return replace(scenario, stack=with_avoidance(scenario, obstacles=(task.sphere(),)))
 
 
 def known_names(tasks: Collection[str], arms: Collection[str]) -> Known:
@@ -82,6 +81,11 @@ def _takes_long(saved: Saved) -> bool:
     """Whether another arm, surfaces of obstacles, or a task are to be made for a scenario before it is shown."""
     shapes = any(isinstance(obstacle, TriangleObstacle) for obstacle in saved.scenario.obstacles)
     return bool(saved.scenario.arm) or saved.own is not None or shapes
+
+
+def pose_of(sight: Sight | None) -> Pose | None:
+    """Return where a camera is that a scenario was saved with."""
+    return None if sight is None else (np.array(sight[0]), np.array(sight[1]))
 
 
 def _sight(pose: Pose | None) -> Sight | None:
@@ -154,6 +158,7 @@ class Visitor(Display):
             pen,
             client.local_storage,
             self._came_back,
+            {name: partial(self._resume, saved) for name, saved in scenarios.items()},
         )
         begun = self._keeper.begun
         at_once = None if begun is None or _takes_long(begun) else begun.scenario
@@ -162,7 +167,7 @@ class Visitor(Display):
         self._panel.connect(self.session)
         self._keeper.begin(self.session, self._resume)
         self._panel.tour.begin(self.session)
-        self.ruler = Ruler(scenarios)
+        self.ruler = Ruler()
         """What the visitor's window is measured with."""
         self.robot.playback.begin(self.session.jobs, self.session.fail)
         keep_ready(self)
@@ -174,8 +179,7 @@ class Visitor(Display):
     def told(self, what: float | Link) -> None:
         """Take the width of the window, CSS pixels, or begin what the link of the page asks for."""
         if isinstance(what, Link):
-            offered = self.ruler.scenarios.items()
-            self._panel.follow(self.session, what, {name: partial(self._resume, saved) for name, saved in offered})
+            self._panel.follow(self.session, what)
         else:
             self._camera.measured(what)
 
@@ -203,8 +207,8 @@ class Visitor(Display):
             self.robot.playback.resume()
         if self.shown is None or frame.task is not self.shown.task or others:
             self._camera.look(frame.task, beside)
-        if (sight := self._keeper.sight(frame)) is not None:
-            self._camera.choose((np.array(sight[0]), np.array(sight[1])))
+        if (pose := pose_of(self._keeper.sight(frame))) is not None:
+            self._camera.choose(pose)
             self._keeper.changed()
         with self.client.atomic():
             self.pictures.draw(frame)
@@ -306,7 +310,7 @@ class Visitor(Display):
         with self._exchanging:
             if self.robot.playback.film is None:
                 self.robot.pose(now, self.pictures.look.tubes)
-                self._panel.pose(self.robot.playback)
+                self._panel.show.timeline.follow(self.robot.playback)
         self.session.let_pass()
 
     def _exchange(self, name: str) -> None:
@@ -362,7 +366,7 @@ class Visitor(Display):
         self.robot.playback.advance(0.0)
         self.client.flush()
         with self._studio.rendering():
-            pose = self._pose_alone(size) if sight is None else (np.array(sight[0]), np.array(sight[1]))
+            pose = pose_of(sight) or self._pose_alone(size)
             shot = shot_of(pose)
             if sight is not None:
                 shot = shot_beside(pose, shot.wxyz, Framing(), size)
@@ -471,7 +475,7 @@ class Visitor(Display):
     @property
     def _legends(self) -> list[Legend | Key]:
         """What explains the colours of a picture."""
-        legend = self._panel.legend
+        legend = self._panel.show.legend
         return [*([] if legend is None else [legend]), *self.pictures.keys]
 
     @property

@@ -16,6 +16,7 @@ NAMES = (
     "latency",
     "drag",
     "scenes",
+    "arms",
     "exactness",
     "learning",
     "pictures",

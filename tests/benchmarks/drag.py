@@ -34,7 +34,6 @@ from dt_viz.avoidance.passing import ANEW
 from dt_viz.evaluate.options import (
     Row,
     add_task,
-    avoiding,
     chosen_task,
     new_engine,
     positive_number,
@@ -46,6 +45,7 @@ from dt_viz.flows.fields import Array
 from dt_viz.metrics import discrete_frechet, resample_by_arc_length
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.scenario.scenario import View
+from dt_viz.scenario.stack import avoiding
 from dt_viz.scenario.tasks import Task
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Frame, Stage

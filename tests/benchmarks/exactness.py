@@ -33,7 +33,6 @@ from dt_viz.evaluate.options import (
     TABLES,
     Row,
     add_task,
-    avoiding,
     chosen_task,
     new_engine,
     number,
@@ -49,7 +48,7 @@ from dt_viz.motion.stack import FINE, build_stack
 from dt_viz.obstacles.clouds import Cloud
 from dt_viz.obstacles.shapes import CloudObstacle, Point, Sphere, as_point
 from dt_viz.scenario.scenario import Layer, Scenario
-from dt_viz.scenario.stack import plane_of
+from dt_viz.scenario.stack import avoiding, plane_of
 from dt_viz.scenario.tasks import Task
 from tests.oracles import stepped as in_steps
 

@@ -27,7 +27,6 @@ from dt_viz.errors import FormatError
 from dt_viz.evaluate.options import (
     TABLES,
     add_task,
-    avoiding,
     chosen_task,
     new_engine,
     positive_number,
@@ -40,7 +39,7 @@ from dt_viz.obstacles.shapes import Box, MeshObstacle, Obstacle, Point, Sphere, 
 from dt_viz.obstacles.solids import Solid
 from dt_viz.scenario.paper_scenes import bottle
 from dt_viz.scenario.scenario import Scenario
-from dt_viz.scenario.stack import anchored, plane_of, with_added, with_avoidance, with_transform
+from dt_viz.scenario.stack import anchored, avoiding, plane_of, with_added, with_avoidance, with_transform
 from dt_viz.scenario.tasks import Task
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Frame, Stage

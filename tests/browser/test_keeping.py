@@ -72,7 +72,7 @@ def test_after_a_reload_the_visitor_finds_what_he_has_made(visit, server):
     seen = visitor.client.camera.position, visitor.client.camera.look_at
     again = reload(page, server)
     assert again.session.scenario == visitor.session.scenario
-    page.get_by_text(re.compile("· restored$")).wait_for()
+    page.get_by_text(re.compile("· as saved$")).wait_for()
     until_drawn(again)
     for before, after in zip(seen, (again.client.camera.position, again.client.camera.look_at), strict=True):
         assert after == pytest.approx(before, abs=2e-3)
@@ -80,11 +80,11 @@ def test_after_a_reload_the_visitor_finds_what_he_has_made(visit, server):
     open_tab(page, "World")
     add(page, "Delete")
     wait_until(lambda: len(again.session.scenario.obstacles) == 1, "it to be gone")
-    page.get_by_text(re.compile("· restored$")).wait_for(state="detached")
+    page.get_by_text(re.compile("· as saved$")).wait_for(state="detached")
     press(page.get_by_role("button", name="Reset", exact=True))
     wait_until(lambda: kept(page) is None, "the browser to forget it")
     anew = reload(page, server)
-    assert anew.session.scenario.view.arm and page.get_by_text(re.compile("· restored$")).count() == 0
+    assert anew.session.scenario.view.arm and page.get_by_text(re.compile("· as saved$")).count() == 0
 
 
 def test_a_browser_that_is_not_allowed_to_keep_anything_says_so_and_the_page_goes_on(visit, server):
@@ -129,6 +129,6 @@ def test_a_killed_server_loses_nothing(browser, cache, fits):
         process.send_signal(signal.SIGKILL)
         process.wait()
     with serving(cache, int(address.rpartition(":")[2])):
-        page.get_by_text(re.compile("· restored$")).wait_for()  # the page connects again by itself
+        page.get_by_text(re.compile("· as saved$")).wait_for()  # the page connects again by itself
         assert kept(page) == made
         page.close()

@@ -75,7 +75,7 @@ def test_an_s_is_drawn_with_the_mouse_and_learned_and_put_back_and_a_reload_open
     wait_until(lambda: server.visitors and visitor not in server.visitors, "another visitor")
     (visitor,) = server.visitors
     wait_until(lambda: visitor.pictures._takes.name.text == "drawn 2", "the takes after the reload")
-    page.get_by_text("restored").wait_for()
+    page.get_by_text("as saved").wait_for()
     assert visitor.session.scenario.task == "own_data_1"
     until_drawn(visitor)
     page.keyboard.press("Escape")

@@ -12,11 +12,7 @@ import pinocchio as pin  # noqa: TID251
 import pytest
 
 from dt_viz.avoidance.avoidance import ArmAvoidance
-from dt_viz.evaluate import arms
-from dt_viz.evaluate.__main__ import main
-from dt_viz.evaluate.arms import Passage
 from dt_viz.evaluate.around import measured
-from dt_viz.evaluate.passable import PassableSettings, has_way, postures_at
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.robot.body_points import BodyPoints
 from dt_viz.robot.models import load_arm, urdf_path
@@ -24,6 +20,10 @@ from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.engine import Engine
 from dt_viz.session.tasks_in_reach import in_reach
+from tests.benchmarks import arms
+from tests.benchmarks.__main__ import main
+from tests.benchmarks.arms import Passage
+from tests.benchmarks.passable import PassableSettings, has_way, postures_at
 
 TASK = "push_box"
 

@@ -78,7 +78,7 @@ def test_what_a_benchmark_cannot_use_is_named(tmp_path, monkeypatch, capsys, arg
     assert message in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", ["latency", "drag", "scenes", "pictures", "rollouts", "velocity", "starts"])
+@pytest.mark.parametrize("name", ["arms", "latency", "drag", "scenes", "pictures", "rollouts", "velocity", "starts"])
 def test_a_command_that_moved_names_a_benchmark_that_there_is(capsys, name):
     assert main([name, "--task", "draw_s"]) == 2
     (line,) = capsys.readouterr().err.splitlines()

@@ -122,7 +122,9 @@ def test_the_plots_and_the_table_show_what_the_profiles_hold(shown, server):
     _, profiles = shown
     plots = HealthPlots(server.gui)
     assert not plots.visible
-    plots.draw(profiles)
+    plots.follow(profiles)
+    assert not plots.table.content  # it is not sent while it is hidden
+    plots.visible = True
     for plot in (plots.lyapunov, plots.distance, plots.clearance):
         assert len(plot.data) == len(plot.series) and all(len(column) == NUM_SAMPLES for column in plot.data)
     np.testing.assert_allclose(plots.clearance.data[1], 1e3 * profiles.shown.clearance)
@@ -131,9 +133,9 @@ def test_the_plots_and_the_table_show_what_the_profiles_hold(shown, server):
         assert f"{1e3 * profile.frechet:.1f} mm" in plots.table.content
         assert f"{1e3 * profile.depth:.1f} mm" in plots.table.content
     before = plots.lyapunov.data
-    plots.draw(None)
+    plots.follow(None)
     assert plots.lyapunov.data is before and plots.clearance.visible
     nowhere = replace(profiles.shown, clearance=np.full(NUM_SAMPLES, np.inf))
-    plots.draw(replace(profiles, shown=nowhere, undisturbed=nowhere))
+    plots.follow(replace(profiles, shown=nowhere, undisturbed=nowhere))
     assert not plots.clearance.visible
     assert plots.table.content.count("–") == 2

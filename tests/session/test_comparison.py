@@ -16,7 +16,7 @@ from dt_viz.evaluate.table1 import drawn
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.models import load_jaco
-from dt_viz.scenario.paper_scenes import FIG_6_DIAMETER, FIG_6_PLACES
+from dt_viz.scenario.paper_scenes import FIG_6_PLACES
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.tasks import TASKS, TaskEntry, drawing_task
 from dt_viz.session.comparison import NEXT, OTHERS, WAITS, curves, scored
@@ -229,7 +229,7 @@ def test_interrupted_between_or_within_steps_it_goes_on_later(new_engine, initia
 def test_figure_6_is_at_the_first_place_of_table_1(engine, name):
     (place,) = drawn(problem_of(engine.nominal(Scenario(name)).learned, engine.follower), 1, 0, 0)
     np.testing.assert_allclose(FIG_6_PLACES[name], place.sphere.position, atol=1e-4)
-    assert place.sphere.diameter == FIG_6_DIAMETER
+    assert place.sphere.diameter == Sphere.diameter
 
 
 # --- The page ---
@@ -269,18 +269,21 @@ def test_what_is_not_installed_is_grey_with_the_command(server, monkeypatch):
 
 def test_plots_have_a_curve_for_each_method_that_moves(server, beside):
     _, _, frames = beside
-    panel = ComparePanel(server.gui, Bindings(), lambda _suffix, _content: None)
-    panel.draw(frames[1].comparison)
-    plots = [plot for both in panel.plots for plot in both]
-    assert [len(plot.data) for plot in plots] == [3] * 4  # the slow one is not there yet
-    panel.draw(frames[-1].comparison)
+    panel = ComparePanel(server.gui, bound := Bindings(), lambda _suffix, _content: None)
+    scenario, plots = frames[-1].scenario, [plot for both in panel.plots for plot in both]
+    bound.adopt(scenario)
+    bound.report(frames[1])
+    assert [len(plot.data) for plot in plots] == [3, 3, 2, 2]  # the slow one is not there yet; the window is hidden
+    bound.report(frames[-1])
+    assert [len(plot.data) for plot in plots] == [4, 4, 2, 2]
+    bound.adopt(replace(scenario, view=replace(scenario.view, large_plots=True)))
     assert [len(plot.data) for plot in plots] == [len(plot.series) for plot in plots] == [4] * 4
     in_tab, in_window = (both[1].data for both in panel.plots)
     np.testing.assert_array_equal(in_tab, in_window)
     named = [compared.method.title for compared in frames[-1].comparison]
     assert all(title in key.content for title in named for key in panel.keys)
-    panel.draw(())
-    assert len(plots[0].data) == 4
+    bound.report(replace(frames[-1], comparison=()))
+    assert len(plots[-1].data) == 4
     server.gui.reset()
 
 

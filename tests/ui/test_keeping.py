@@ -123,11 +123,11 @@ def test_the_line_of_status_says_so_until_the_next_edit(opened_for):
     page = opened_for(Browser(**{KEY: made()}))
     progress = replace(page.session._screen.progress, shown=frame_of(MADE, task=None, rollouts=()))
     assert progress.restored == progress.wanted == MADE
-    assert "restored" in verdict(progress).line.split(" · ")
+    assert "as saved" in verdict(progress).line.split(" · ")
     page.session.edit("test", warp=0.5)
     wanted = page.session._screen.progress.wanted
-    assert "restored" not in verdict(replace(progress, wanted=wanted)).line
-    assert "restored" not in verdict(replace(progress, restored=None)).line
+    assert "as saved" not in verdict(replace(progress, wanted=wanted)).line
+    assert "as saved" not in verdict(replace(progress, restored=None)).line
 
 
 @pytest.mark.long

@@ -8,6 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from pages import frame_of
 
 from dt_viz.baselines.registry import METHODS
 from dt_viz.motion.following import ArmMotion
@@ -89,12 +90,10 @@ def test_what_compared_methods_do_is_saved(page, sent, rng):
     scores = Scores(*rng.uniform(size=len(fields(Scores))))
     moves, waits = (METHODS[name] for name in ("linear", "mpnet"))
     drawn = rng.uniform(size=(NUM_SAMPLES, 2))
-    comparison = [
-        Compared(moves, scores=scores, curves=drawn),
-        Compared(waits, note="no way, yet"),
-    ]
+    comparison = Compared(moves, scores=scores, curves=drawn), Compared(waits, note="no way, yet")
     page.session.edit("test", view=View(compared=("linear", "mpnet")))
-    page.visitor._panel._compare.draw(comparison)
+    scenario = page.session.scenario
+    page.visitor._panel.bindings.report(frame_of(scenario, task=page.session.task, comparison=comparison))
     pressed(page)
     assert [name.removeprefix("dt-viz-draw_s") for name in sent] == ["-methods.csv", "-methods-path.csv"]
     table, curves = (read(content) for content in sent.values())

@@ -307,14 +307,14 @@ def test_what_is_drawn_of_another_task_or_scene_is_grey_until_its_own_frame_come
     assert not is_grey(pictures)
     chosen = replace(scenario, **changes)
     pictures.adopt(chosen)
-    assert is_grey(pictures) and pictures.stale
+    assert is_grey(pictures) and pictures.look.stale
     pictures.draw(next(engine.frames(scenario)))  # what was under way when it was chosen
     assert is_grey(pictures)
     pictures.adopt(scenario)
     assert not is_grey(pictures)
     pictures.adopt(chosen)
     pictures.draw(replace(next(engine.frames(scenario)), scenario=chosen))
-    assert not is_grey(pictures) and not pictures.stale
+    assert not is_grey(pictures) and not pictures.look.stale
 
 
 def test_nothing_is_grey_while_something_is_dragged(drawn):

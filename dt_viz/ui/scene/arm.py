@@ -153,7 +153,7 @@ def _add_copies(
     return scene.add_batched_meshes_simple(name, mesh.vertices, mesh.faces, unturned, np.zeros((num, 3)), **look)
 
 
-class ArmSequence(Following, Picture):
+class ArmSequence(Following[ArmMotion], Picture):
     """Several arms along the motion, from faint at its start to strong at its end; a drag sends only their poses."""
 
     def __init__(self, scene: viser.SceneApi, robot: Robot) -> None:
@@ -171,8 +171,8 @@ class ArmSequence(Following, Picture):
     def draw(self, frame: Frame, look: Look) -> None:
         self.follow(frame.arm)
 
-    def _show(self, motion: ArmMotion) -> None:
-        rotations, origins = self._robot.forward_kinematics(arms_along(self._robot, motion))
+    def _show(self, newest: ArmMotion) -> None:
+        rotations, origins = self._robot.forward_kinematics(arms_along(self._robot, newest))
         wxyzs = transforms.SO3.from_matrix(rotations).wxyz
         for joint, link in self.links.items():
             # the browser blends nodes from far to near by their own positions

@@ -55,15 +55,11 @@ class _Plane:
         """Places (*B, 2) of world points (*B, 3), metres."""
         return (points - self.area.centre) @ self.axes
 
-    def strokes(self, label: str, style: Style, paths: Iterable[Array], number: int = 0) -> Strokes:
-        """Paths (T_i, 3), metres, in the style's colour of a number; empty ones are left out."""
-        seen = [self.across(path) for path in paths if len(path)]
+    def strokes(self, label: str, style: Style, paths: Iterable[Array] | None, number: int = 0) -> Strokes:
+        """Paths (T_i, 3), metres, if any, in the style's colour of a number; empty ones are left out."""
+        seen = [self.across(path) for path in (() if paths is None else paths) if len(path)]
         width, is_directed = style.width or style.radius, style in (STYLES.streamline, STYLES.panel_streamline)
         return Strokes(label, seen, _hex(style.on(LIGHT, number)), width, bool(style.dash), is_directed, style.ball > 0)
-
-    def segments(self, label: str, style: Style, segments: Array | None) -> Strokes:
-        """Segments (K, 2, 3), metres, one after the other where they meet."""
-        return self.strokes(label, style, () if segments is None else segments)
 
     def points(self, places: Sequence[Array | Point], colour: Colour) -> tuple[Array, str]:
         """Places in the world, metres, and their colour."""
@@ -137,8 +133,8 @@ def _scene(frame: Frame, title: str) -> Drawing:
     beside = [path for compared in others.values() for path in compared.paths]
     plane = _Plane.of(frame.slice.holding([*frame.task.paths, *rollouts.values(), *beside]), frame)
     strokes = [
-        plane.segments("warped grid", STYLES.grid, pictures.grid),
-        plane.strokes("streamlines", STYLES.streamline, pictures.streamlines or ()),
+        plane.strokes("warped grid", STYLES.grid, pictures.grid),
+        plane.strokes("streamlines", STYLES.streamline, pictures.streamlines),
         plane.strokes("demonstrations", STYLES.demonstration, demonstrations),
         plane.strokes("undisturbed", STYLES.ghost, ghost),
         plane.strokes("rollouts of the level", STYLES.level, () if frame.level is None else frame.levels[frame.level]),
@@ -180,10 +176,10 @@ def _function(area: _Plane, picture: ColourPicture, seen: _Plane) -> Levels:
 def _panel(panel: PanelPicture, frame: Frame) -> Drawing:
     plane = _Plane.of(panel.area, frame)
     strokes = [
-        plane.segments("lattice", STYLES.panel_grid, panel.grid),
+        plane.strokes("lattice", STYLES.panel_grid, panel.grid),
         plane.strokes("streamlines", STYLES.panel_streamline, panel.streamlines),
         plane.strokes("demonstrations", STYLES.demonstration, panel.demonstrations),
-        plane.segments("outline", STYLES.outline, panel.outlines),
+        plane.strokes("outline", STYLES.outline, panel.outlines),
         plane.strokes("rollouts", STYLES.panel_rollout, panel.rollouts),
     ]
     points = {} if panel.goal is None else {"goal": plane.points([panel.goal], LIGHT.goal)}

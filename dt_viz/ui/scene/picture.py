@@ -7,14 +7,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
 from dt_viz.flows.fields import Array
-from dt_viz.session.engine import ArmMotion
 from dt_viz.session.frame import Frame
 from dt_viz.ui.scene.key import Key
 from dt_viz.ui.scene.palette import LIGHT, Theme, linear
@@ -44,31 +43,34 @@ class Shown:
         """Draw what was left out while it was hidden; most parts need nothing."""
 
 
-class Following(Shown, ABC):
-    """A part of the page that is drawn from the newest motion, only while it is shown."""
+_Followed = TypeVar("_Followed")
+
+
+class Following(Shown, ABC, Generic[_Followed]):
+    """A part of the page that is drawn from the newest motion, or what is told of it, only while it is shown."""
 
     def __init__(self, node: Any) -> None:  # noqa: ANN401 - a node of the scene, or a folder of the panel
         super().__init__(node)
-        self._motion: ArmMotion | None = None
-        self._drawn: ArmMotion | None = None
+        self._newest: _Followed | None = None
+        self._drawn: _Followed | None = None
         self._drawing = threading.Lock()  # it is switched on by another thread than the one that computes
 
-    def follow(self, motion: ArmMotion | None) -> None:
-        """Show this motion; None leaves what is there."""
-        self._motion = motion or self._motion
+    def follow(self, newest: _Followed | None) -> None:
+        """Show this; None leaves what is there."""
+        self._newest = newest or self._newest
         if self.visible:
             self._catch_up()
 
     def _catch_up(self) -> None:
         with self._drawing:
-            motion = self._motion
-            if motion is not None and motion is not self._drawn:
-                self._drawn = motion
-                self._show(motion)
+            newest = self._newest
+            if newest is not None and newest is not self._drawn:
+                self._drawn = newest
+                self._show(newest)
 
     @abstractmethod
-    def _show(self, motion: ArmMotion) -> None:
-        """Draw a motion."""
+    def _show(self, newest: _Followed) -> None:
+        """Draw it."""
 
 
 @dataclass(frozen=True)

@@ -119,11 +119,6 @@ class ScenePictures:
         """What names lines in a saved picture."""
         return [key for picture in self._by_view.values() if (key := picture.key) is not None]
 
-    @property
-    def stale(self) -> bool:
-        """Whether the last frame belongs to another task or scene than the scenario adopted since."""
-        return not (self._frame is None or self._adopted is None or self._frame.scenario.begins_like(self._adopted))
-
     def take(self, scene: viser.SceneApi, robot: Robot) -> None:
         """Show another arm from now on."""
         with self._drawing:
@@ -169,11 +164,12 @@ class ScenePictures:
 
     def _wanted_look(self) -> Look:
         """How the frame is to be drawn: a stale one as one that there is no motion for."""
-        frame, tubes, stale = self._frame, self.look.tubes, self.stale
+        frame, tubes, adopted = self._frame, self.look.tubes, self._adopted
         if frame is None:
             return self.look
+        stale = adopted is not None and not frame.scenario.begins_like(adopted)
         blocked = stale or bool(frame.blocked)
-        shown = self._adopted is None or self._adopted.view.rollouts
+        shown = adopted is None or adopted.view.rollouts
         if tubes.rollouts is not frame.rollouts or tubes.shown != shown:
             tubes = RolloutTubes(frame.rollouts, shown)
         return Look(self._theme.without_motion if blocked else self._theme, blocked, stale, tubes)

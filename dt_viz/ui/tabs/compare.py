@@ -14,11 +14,11 @@ from viser import uplot
 
 from dt_viz.baselines.base import INSTALL, Method
 from dt_viz.motion.profiles import NUM_SAMPLES
-from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.session.comparison import OTHERS, OURS
-from dt_viz.session.frame import Compared
+from dt_viz.session.frame import Compared, Frame
 from dt_viz.session.session import Session
-from dt_viz.ui.bindings import Bindings
+from dt_viz.ui.bindings import KEEP, Bindings
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.comparison import COLOURS
 from dt_viz.ui.scene.palette import css
@@ -46,8 +46,8 @@ class ComparePanel:
         """Build the controls where the panel is being built; `send` gets the end of a file's name, and its content."""
         self._send = send
         self._comparison: Sequence[Compared] = ()
-        self._drawn: tuple[Method, ...] = ()
-        """Methods in the plots."""
+        self._drawn: list[Sequence[Method]] = [(), ()]
+        """Methods in the plots below the table, and in those in a window."""
         with gui.add_folder("Methods"):  # closed by a click, so that the table is seen at once on a small screen
             for method in OTHERS:
                 box = gui.add_checkbox(method.title, False, disabled=bool(method.missing), hint=hint(method))
@@ -81,11 +81,10 @@ class ComparePanel:
         save = gui.add_button(SAVE, icon=viser.Icon.DOWNLOAD, hint=what, visible=False)
         bindings.later(save, self._save, visible=compares)
         bindings.properties(self.table, visible=compares)
+        bindings.show(lambda s: _shown(bindings.frame, s.view) or KEEP, lambda shown: self.draw(*shown))
 
-    def draw(self, comparison: Sequence[Compared]) -> None:
-        """Show how methods fare; nothing leaves what is there."""
-        if not comparison:
-            return
+    def draw(self, comparison: Sequence[Compared], large: bool) -> None:
+        """Show how methods fare, with the plots below the table, or the `large` ones in a window."""
         self._comparison = comparison
         self.table.content = table_html(comparison)
         plotted = [compared for compared in comparison if compared.curves is not None]
@@ -93,13 +92,12 @@ class ComparePanel:
         curves = [1e3 * compared.curves for compared in plotted if compared.curves is not None]
         along = np.linspace(0, 1, NUM_SAMPLES)
         marks = {method.title: f"background:{css(_colour(method.name))}" for method in methods}
-        for plots, key in zip(self.plots, self.keys, strict=True):
-            key.content = legend(marks, "0.3em")
-            for k, plot in enumerate(plots):
-                if methods != self._drawn:
-                    plot.series = (uplot.Series(label="path"), *_curves(methods))
-                plot.data = columns(along, *(curve[:, k] for curve in curves)) if curves else (np.zeros(2),) * 2
-        self._drawn = methods
+        self.keys[large].content = legend(marks, "0.3em")
+        for k, plot in enumerate(self.plots[large]):
+            if methods != self._drawn[large]:
+                plot.series = (uplot.Series(label="path"), *_curves(methods))
+            plot.data = columns(along, *(curve[:, k] for curve in curves)) if curves else (np.zeros(2),) * 2
+        self._drawn[large] = methods
 
     def _save(self, _session: Session, _pressed: bool) -> None:
         for name, table in (
@@ -107,6 +105,11 @@ class ComparePanel:
             ("methods-path", curves_table(self._comparison)),
         ):
             self._send(f"-{name}.csv", table_csv(table))
+
+
+def _shown(frame: Frame | None, view: View) -> tuple[Sequence[Compared], bool] | None:
+    """The methods whose table and plots are shown, and whether the plots are large; None where none are known."""
+    return (frame.comparison, view.large_plots) if frame is not None and frame.comparison and view.compared else None
 
 
 def hint(method: Method) -> str:

@@ -21,15 +21,13 @@ from dt_viz.obstacles.files import (
     read_cloud,
     read_mesh,
 )
-from dt_viz.obstacles.shapes import CloudObstacle, MeshObstacle, Obstacle, Point
+from dt_viz.obstacles.shapes import ORIGIN, CloudObstacle, MeshObstacle, Obstacle
 from dt_viz.scenario.scenario import MAX_OBSTACLES, Scenario
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.controls import Control, on_press
 from dt_viz.warning import Severity
 
-ORIGIN: Point = (0.0, 0.0, 0.0)
-"""Place of an obstacle that is not put anywhere yet."""
 FORMATS = ", ".join(dict.fromkeys(suffix[1:] for suffix in (*MESH_SUFFIXES, *CLOUD_SUFFIXES)))
 PLACED = "put where there is room beside the motion, not where the file has it: drag it to its place"
 LANE = "file"

@@ -11,6 +11,7 @@ import viser
 from dt_viz.errors import Cancelled
 from dt_viz.pictures.video import VIDEO_SUFFIXES
 from dt_viz.session.session import Session
+from dt_viz.ui import patches
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.controls import Control, on_press, switch
 from dt_viz.ui.scene.camera import HAND, HOME, VIEWS, CameraController, Framing
@@ -31,26 +32,7 @@ LARGEST_VIDEO = "1920 × 1080"
 SAVE_PICTURE, SAVE_VIDEO = "Save picture", "Save video"
 Film = Callable[[str, str, str, Step, Cancelled], bytes]
 """Function that makes a video of `MOTION`, `TURNTABLE` or `WARP`, with a suffix, of a resolution."""
-ROW = (
-    "<style>div:has(> .dt-row) + div > div > :first-child { width: auto !important; }</style><div class='dt-row'></div>"
-)
-"""Mark and style of a group of buttons that needs the room beside its label to lie in one row."""
 BACK, ON, END = "Previous", "Next", "End"
-ALONE = """<style>
-.mantine-Paper-root:has(.dt-caption) { visibility: hidden; }
-.dt-caption, div:has(> .dt-caption) + div { visibility: visible; position: fixed; bottom: 0; box-sizing: border-box; }
-.dt-caption {
-    left: 0; right: 0; padding: 2.2em 13em 1.2em 2.4em; pointer-events: none; color: var(--mantine-color-text);
-    background: linear-gradient(to top, var(--mantine-color-body) 35%, transparent);
-}
-.dt-caption h1 { margin: 0; font-size: clamp(1.5rem, 3.2vw, 4rem); line-height: 1.2; font-weight: 650; }
-.dt-caption p { margin: 0.2em 0 0; font-size: clamp(1rem, 1.7vw, 2.2rem); line-height: 1.3; }
-div:has(> .dt-caption) + div { right: 1em; width: 11.5em; padding: 0 0 1em; }
-div:has(> .dt-caption) + div label { display: none; }
-div:has(> .dt-caption) + div > div > :first-child { display: none; }
-@media (max-width: 700px) { .dt-caption { padding: 1.6em 1.2em 3.4em; } }
-</style>"""
-"""Style that hides the panel around the caption, and puts that and the buttons after it at the foot of the window."""
 
 
 class PictureTab:
@@ -77,7 +59,7 @@ class PictureTab:
         page that replays the motion, `film` a video.
         """
         self._tripod = tripod
-        gui.add_html(ROW)
+        gui.add_html(patches.ROW)
         Control(gui.add_button_group("View", (*VIEWS, HAND, HOME), hint="where the camera looks from"), tripod.view)
 
         def box(label: str, hint: str) -> viser.GuiCheckboxHandle:
@@ -207,7 +189,7 @@ class Presentation:
         """Change the title of what is shown, or the caption that says what to see."""
         self._texts |= {name: html.escape(text) for name, text in texts.items()}
         shown = "<h1>{title}</h1><p>{caption}</p>".format(**self._texts)
-        self._html.content = f"{ALONE}<div class='dt-caption'>{shown}</div>"
+        self._html.content = f"{patches.ALONE}<div class='dt-caption'>{shown}</div>"
 
     def _press(self, button: str) -> None:
         if button == END:

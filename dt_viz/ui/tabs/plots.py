@@ -23,7 +23,7 @@ from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.playback import Replay
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.palette import Colour, css
-from dt_viz.ui.scene.picture import Following, Shown
+from dt_viz.ui.scene.picture import Following
 from dt_viz.ui.tabs.data import SAVE, joints_table, path_table, table_csv
 
 NUM_SAMPLES, RATE = 80, 10
@@ -142,7 +142,7 @@ def joint_curves(motion: ArmMotion, robot: Robot) -> JointCurves:
     return JointCurves(times, angles, speeds)
 
 
-class JointPlots(Following):
+class JointPlots(Following[ArmMotion]):
     """A folder, or a window, with the plots of the joints."""
 
     def __init__(self, gui: viser.GuiApi, *, large: bool = False) -> None:
@@ -158,7 +158,7 @@ class JointPlots(Following):
 
     def take(self, robot: Robot) -> None:
         """Show a robot's motions from now on."""
-        self._robot, self._motion = robot, None
+        self._robot, self._newest = robot, None
         limited = [j for j in range(robot.num_joints) if np.isfinite(robot.lower[j])]
         self._limits = np.degrees(np.stack([robot.lower[limited], robot.upper[limited]], axis=1)).ravel()
         colours = [colour for colour, _ in zip(cycle(palette.LIGHT.joints), robot.joint_names, strict=False)]
@@ -171,19 +171,18 @@ class JointPlots(Following):
             plot.series = (uplot.Series(label=ACROSS["time"]), *curves)
             plot.data = (np.zeros(2),) * (1 + len(curves))
 
-    def _show(self, motion: ArmMotion) -> None:
-        curves = joint_curves(motion, self._robot)
+    def _show(self, newest: ArmMotion) -> None:
+        curves = joint_curves(newest, self._robot)
         limits = np.tile(self._limits, (len(curves.times), 1))
         self.angles.data = columns(curves.times, curves.angles, limits)
         speeds, limit = np.minimum(curves.speeds, MAX_SPEED), np.full((len(curves.times), 1), 100.0)
         self.speeds.data = columns(curves.times, speeds, limit)
 
 
-class HealthPlots(Shown):
+class HealthPlots(Following[Profiles]):
     """A folder, or a window, with three plots and a table: the shown motion beside the one without behaviours."""
 
     def __init__(self, gui: viser.GuiApi, *, large: bool = False) -> None:
-        self._drawn: Profiles | None = None
         node, content = add_container(gui, "Along the path", large=large)
         super().__init__(node)
         self._height = 130 * (LARGE if large else 1)
@@ -203,18 +202,14 @@ class HealthPlots(Shown):
         without = curve("without", colour, width=1.5, dashed=True)
         return add_plot(gui, title, "path", (curve("shown", colour), without, *more), self._height)
 
-    def draw(self, profiles: Profiles | None) -> None:
-        """Show these profiles; None leaves what is there."""
-        if profiles is None or profiles is self._drawn:
-            return
-        self._drawn = profiles
-        along, shown, without = profiles.along, profiles.shown, profiles.undisturbed
+    def _show(self, newest: Profiles) -> None:
+        along, shown, without = newest.along, newest.shown, newest.undisturbed
         self.lyapunov.data = columns(along, shown.lyapunov, without.lyapunov)
         self.distance.data = columns(along, 1e3 * shown.distance, 1e3 * without.distance)
-        which = "mean demonstration" if profiles.of_mean else "demonstration"
+        which = "mean demonstration" if newest.of_mean else "demonstration"
         self._to.content = small(f"Distance to the {which} [mm]", tight=True)
         bounded = bool(np.isfinite(shown.clearance).all())
-        whose = "body points" if profiles.of_body else "end effector"
+        whose = "body points" if newest.of_body else "end effector"
         self._whose.content = small(
             f"Clearance of the {whose} [mm]" if bounded else "Clearance: no obstacle", tight=True
         )
@@ -222,7 +217,7 @@ class HealthPlots(Shown):
         if bounded:
             clearances = 1e3 * shown.clearance, 1e3 * without.clearance
             self.clearance.data = columns(along, *clearances, np.zeros(len(along)))
-        self.table.content = table_html(profiles)
+        self.table.content = table_html(newest)
 
 
 class Plots:
@@ -265,7 +260,7 @@ class Plots:
         self._draw_joints()
         self._profiles = frame.profiles or self._profiles
         for plots in self.health:
-            plots.draw(frame.profiles)
+            plots.follow(frame.profiles)
 
     def mark(self, player: Replay | None, *, past: bool = False) -> str:
         """Show what the robot did, if it is that which is played, on the joints' plots.

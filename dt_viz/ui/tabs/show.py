@@ -55,10 +55,6 @@ class ShowTab:
         num_flows = lambda _s: _num_flows(bindings.frame)  # noqa: E731
         bindings.slider(gui, "generator_layer", visible=lambda s: s.view.generator, max=num_flows)
 
-    def draw(self, frame: Frame) -> None:
-        """Show a frame in the plots."""
-        self.plots.draw(frame)
-
     def _add_slice(self, gui: viser.GuiApi, bindings: Bindings) -> None:
         """Add the controls of the slice, with a legend of its colours."""
         bindings.checkbox(gui, "move_slice")

@@ -24,6 +24,7 @@ from dt_viz.scenario.stack import (
 from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.progress import Message, Pace, Progress
 from dt_viz.session.session import Session
+from dt_viz.ui import patches
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.scene.palette import Colour, ink, paper
 from dt_viz.ui.tabs.plots import small
@@ -101,7 +102,7 @@ def verdict(progress: Progress) -> Verdict:
     if known.lyapunov_falls is not None:
         figures += ("stable" if known.lyapunov_falls else "not stable",)
     if progress.wanted == progress.restored:
-        figures += ("restored",)
+        figures += ("as saved",)
     else:
         figures += (f"{1e3 * latency:.0f} ms" if latency < 1 else f"{latency:.1f} s",)
     head, severity, reason = _judged(frame, concerns(frame, view))
@@ -238,13 +239,6 @@ def hint_html(text: str) -> str:
     return place_html(text, (40, 44, 52), HINT)
 
 
-def steps_html(steps: tuple[bool, bool]) -> str:
-    """Return what dims the first two of the buttons after it, Undo and Redo, where there is no such step."""
-    idle = (f"div:has(> .dt-steps) + div button:nth-of-type({k})" for k, step in enumerate(steps, start=1) if not step)
-    style = "".join(f"{button} {{ opacity: 0.35; pointer-events: none; }}" for button in idle)
-    return f"<style>{style}</style><div class='dt-steps'></div>"
-
-
 def progress_html(fraction: float) -> str:
     """Return a bar of progress, from 0 to 1."""
     full, pale = COLOURS[Severity.NOTE]
@@ -348,7 +342,7 @@ def sentence(text: str) -> str:
 
 
 class StatusLine:
-    """The controls of the status, and the style of the buttons after them, see `steps_html`.
+    """The controls of the status, and the style of the buttons after them, see `patches.steps_html`.
 
     They keep their height whatever comes: a button takes its room from the reason's.
     """
@@ -363,7 +357,7 @@ class StatusLine:
         self.cancel = gui.add_button("Cancel", icon=viser.Icon.X, visible=False)
         with gui.add_folder("Details", expand_by_default=False):
             self.details = gui.add_html("")
-        self.steps = gui.add_html(steps_html((False, False)))
+        self.steps = gui.add_html(patches.steps_html((False, False)))
         bindings.on(self.cancel, lambda session, _pressed: session.cancel())
         bindings.on(self.mend, lambda session, _pressed: self._mend(session))
 
@@ -383,7 +377,7 @@ class StatusLine:
             (fraction, text), severity = progress.learning, Severity.NOTE
             below = progress_html(fraction)
         self._told, frame = progress, progress.shown
-        self.steps.content = steps_html(progress.steps if progress.beside is None else progress.beside)
+        self.steps.content = patches.steps_html(progress.steps if progress.beside is None else progress.beside)
         mends = None
         if frame is not None and progress.message is None and not progress.stale:
             mends = remedy(frame, progress)

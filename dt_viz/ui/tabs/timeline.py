@@ -12,6 +12,7 @@ import viser
 from dt_viz.scenario.scenario import OFFERS
 from dt_viz.session.recording import SPAN
 from dt_viz.session.session import Session
+from dt_viz.ui import patches
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.controls import Control
 from dt_viz.ui.playback import Playback, Replay
@@ -25,12 +26,6 @@ LIVE, REPLAY, PAST = "Live", "Replay", f"Last {SPAN:.0f} s"
 BACK, PLAY, PAUSE, ON = "◂ Step", "Play", "Pause", "Step ▸"
 WIDTH = 340.0
 """Width of the window, CSS pixels."""
-AT_THE_FOOT = """<style>@media (max-width: 576px) {
-  div:has(> .mantine-Tabs-root .dt-timeline) {
-    position: sticky; bottom: 0; z-index: 1; background: var(--mantine-color-body);
-  }
-}</style><div class='dt-timeline'></div>"""
-"""Mark and style of the window's content: on a phone, where it is a part of the sheet, it stays at the foot."""
 
 
 class Timeline:
@@ -46,7 +41,7 @@ class Timeline:
         self.panel = gui.add_panel(visible=False)
         self.panel.float(x=15, y=-15, width=WIDTH)
         with self.panel.add_tab("Timeline"):
-            gui.add_html(AT_THE_FOOT)
+            gui.add_html(patches.AT_THE_FOOT)
             self._mark = gui.add_html(cursor_html())
             hint = (
                 f"{REPLAY}: the finished motion, which follows your edits. {PAST}: what the robot did, which edits "

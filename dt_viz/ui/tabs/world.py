@@ -15,7 +15,7 @@ from dt_viz.avoidance import registry
 from dt_viz.avoidance.transform import Transform
 from dt_viz.motion.following import room_at_rest
 from dt_viz.obstacles import files as shapes
-from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, MeshObstacle, Obstacle, Sphere, as_point
+from dt_viz.obstacles.shapes import ORIGIN, Box, CloudObstacle, Cylinder, MeshObstacle, Obstacle, Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.inverse_kinematics import UnreachableError
 from dt_viz.scenario.scenario import MAX_DIAMETER, MAX_MARGIN, MAX_OBSTACLES, MIN_DIAMETER, Scenario
@@ -24,7 +24,7 @@ from dt_viz.scenario.starts import followed, label_of, with_grid, with_label
 from dt_viz.scenario.tasks import Task
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import KEEP, Bindings
-from dt_viz.ui.tabs.from_file import ORIGIN, FileLoader, has_room
+from dt_viz.ui.tabs.from_file import FileLoader, has_room
 from dt_viz.ui.tabs.settings import add_settings, settings_of_purpose
 from dt_viz.warning import Severity
 

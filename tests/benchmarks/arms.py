@@ -1,6 +1,6 @@
 """Measure arms: loading, tasks in reach, random balls in the way, the robot in the loop, the frames of a drag.
 
-    python -m dt_viz.evaluate arms --arm panda ur5 --count 50 --seed 0 --out arms.npz
+    python -m tests.benchmarks arms --arm panda ur5 --count 50 --seed 0 --out arms.npz
 
 Each arm follows the tasks that ship with DT-Viz, placed in its reach. A ball's middle is near the hand, or near a point
 of a random link that moves, in a random posture of a random task's motions; it is nearer to the arm there than the
@@ -31,14 +31,12 @@ from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.control.controller import ArmController
 from dt_viz.evaluate.around import ALLOWANCE, in_ball, measured
 from dt_viz.evaluate.options import (
-    avoiding,
     interval,
     new_engine,
     report,
     whole_number,
     write_npz,
 )
-from dt_viz.evaluate.passable import has_way, postures_at
 from dt_viz.evaluate.reactive import SETTINGS, driven
 from dt_viz.flows.fields import Array
 from dt_viz.folders import default_cache_folder
@@ -49,10 +47,11 @@ from dt_viz.robot.cover import protrusion
 from dt_viz.robot.inverse_kinematics import UnreachableError
 from dt_viz.robot.models import ARMS
 from dt_viz.scenario.scenario import Scenario
-from dt_viz.scenario.stack import with_avoidance
+from dt_viz.scenario.stack import avoiding, with_avoidance
 from dt_viz.scenario.tasks import TASKS, Task
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Stage
+from tests.benchmarks.passable import has_way, postures_at
 
 OUT = "FILE.npz"
 SPREAD = 0.05
