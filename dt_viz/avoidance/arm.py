@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from dt_viz.avoidance.arm_field import JointLimits, WholeArmField
 from dt_viz.avoidance.arm_settings import WholeArmSettings
-from dt_viz.avoidance.arm_solver import MAX_DURATION, ROUNDING, SLOPE, ArmSolution, Solver
+from dt_viz.avoidance.arm_solver import MARGIN_TOLERANCE, MAX_DURATION, SLOPE, ArmSolution, Solver
 from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.avoidance.detour import Detour, carried_over, escape_directions
 from dt_viz.avoidance.lift import Lift
@@ -27,6 +27,7 @@ from dt_viz.kernels.dodging import Forecast, LimitedArm, dodge
 from dt_viz.kernels.limits import barrier, velocity_bounds
 from dt_viz.kernels.proximity import contacts, least_contacts, proximity
 from dt_viz.kernels.tubes import evenly_bent, tubes
+from dt_viz.numerics import unit
 from dt_viz.obstacles.shapes import Obstacle, Sphere, records
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.inverse_kinematics import track
@@ -180,14 +181,13 @@ class WholeArm:
         q, parts, margin = lifted.tracked.q[lifted.shaping], avoidance.avoided.parts, avoidance.margin
         settings, detour = self.settings, sized(avoidance.detour, self.robot.size)
         beside = max(settings.beside, margin)
-        tangents = np.gradient(self.robot.end_effector(q), axis=1).reshape(-1, 3)
-        tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
+        tangents = unit(np.gradient(self.robot.end_effector(q), axis=1).reshape(-1, 3))
         q = q.reshape(-1, q.shape[-1])
         clearance = np.array([self.body.outermost.clearance(self.robot, q, part, beside) for part in parts])  # at most
         clearance = clearance.reshape(len(parts), len(q))
         near: Mask = clearance < margin
         for part, mask in zip(parts, near, strict=True):
-            mask[mask] = self.clearance(q[mask], part, margin, margin - ROUNDING) < margin
+            mask[mask] = self.clearance(q[mask], part, margin, margin - MARGIN_TOLERANCE) < margin
 
         def escapes(which: Indices) -> list[Array]:
             """Directions that leave all of these obstacles."""

@@ -7,7 +7,7 @@ out of an obstacle; `JointLimits` bends Rⁿ so that no flow leaves the joint li
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -27,10 +27,8 @@ from dt_viz.robot.robot import Robot
 DIFFERENCE = 1e-4
 """Step of the finite differences for the slope of an obstacle's distance, metres."""
 
-LIMIT_ZONE = 0.05
-"""Width of the zone before a joint limit in which joints are held back, rad."""
 NEAREST_TO_LIMIT = 0.9
-"""Part of that zone that a planned path may use."""
+"""Part of the zone before a joint limit that a planned path may use."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,23 +162,20 @@ class JointLimits(Diffeomorphism):
     Joints outside the zone, and continuous ones, are not changed.
     """
 
+    SCALED = ("fraction",)
     lower: Array
     """(n,) rad, −inf for continuous joints."""
     upper: Array
     """(n,) rad, +inf for continuous joints."""
-    zone: float = LIMIT_ZONE
+    zone: float = 0.05
     """m, rad."""
     fraction: float = 1.0
-    """Part s of that time: (e/m)² becomes s·(e/m)² in both formulas."""
+    """Part s of that time: (e/m)² becomes s·(e/m)² in both formulas; less than 1 holds no joint inside its limits."""
 
     @property
     def dim(self) -> int:
         """Dimension of configuration space."""
         return len(self.lower)
-
-    def scaled(self, fraction: float) -> JointLimits:
-        """A part of the flow does not hold joints inside their limits."""
-        return replace(self, fraction=fraction * self.fraction)
 
     def inside(self, q: Array) -> Array:
         """Clip configurations (*B, n) to a little less than the limits, where ψ is finite."""

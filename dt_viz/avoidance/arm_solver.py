@@ -15,7 +15,7 @@ from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.avoidance.clearing import Lack, clearing_duration
 from dt_viz.avoidance.detour import Detour
 from dt_viz.avoidance.lift import Lift
-from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Diffeomorphism, Flow, Identity
+from dt_viz.flows.diffeomorphisms import Conjugated, Diffeomorphism, Flow, Identity
 from dt_viz.flows.fields import Array, Indices, Mask, VectorField
 from dt_viz.flows.rollouts import Bundle, refined
 from dt_viz.kernels.blocks import room_asked
@@ -37,7 +37,7 @@ SLOPE = 0.1
 """Slope, m/m, at which the required clearance grows away from a start or goal that has less than the margin."""
 MOVED = 5e-3
 """Smallest shift of an added start by the avoidance that is reported, metres."""
-ROUNDING = 1e-3
+MARGIN_TOLERANCE = 1e-3
 """Tolerance of a clearance, metres."""
 COARSE_STEP = 0.25
 """Length of a coarse RK4 step, in flow time: off by at most 1.2 mm at the hand in drags around Draw S and push box."""
@@ -110,8 +110,10 @@ class Solver:
         self._spacing = spacing
         self._coarse = coarse and self._generator is not None
         self._between = between
-        self._margin = max(float(avoidance.margin), 2 * ROUNDING)
-        self._room = body.clearance(robot, lifted.pins, avoidance.avoided, self._margin + ROUNDING) - ROUNDING
+        self._margin = max(float(avoidance.margin), 2 * MARGIN_TOLERANCE)
+        self._room = (
+            body.clearance(robot, lifted.pins, avoidance.avoided, self._margin + MARGIN_TOLERANCE) - MARGIN_TOLERANCE
+        )
 
     @cached_property
     def _settings(self) -> WholeArmSettings:
@@ -147,7 +149,7 @@ class Solver:
         automatic, longest = self._generator is not None and self._avoidance.duration is None, self._between[1]
         for _ in range(MAX_ROUNDS if automatic else 0):
             lacking = self._shaping(bundle) & (asked > kept)
-            if duration >= longest or (asked - kept)[lacking].max(initial=0.0) <= ROUNDING:
+            if duration >= longest or (asked - kept)[lacking].max(initial=0.0) <= MARGIN_TOLERANCE:
                 break
             p = bundle.positions[lacking] / self._robot.levers
             more = min(self._clearing_duration(p), longest - duration)
@@ -174,7 +176,7 @@ class Solver:
         self, bundle: Bundle, transform: Diffeomorphism, duration: float, asked: Array, kept: Array
     ) -> ArmSolution:
         p = bundle.positions / self._robot.levers
-        shaping, near = self._shaping(bundle), asked - kept > ROUNDING
+        shaping, near = self._shaping(bundle), asked - kept > MARGIN_TOLERANCE
         q = self._lifted.at(bundle.index, bundle.fraction)
         away = np.linalg.norm(self._robot.end_effector(p) - self._robot.end_effector(q), axis=1) > MOVED
         samples = near & shaping, near & ~shaping, away & ~shaping & (bundle.fraction == 0)
@@ -202,7 +204,7 @@ class Solver:
         elif self._coarse:
             flow = Flow(self._generator, duration, math.ceil(duration / COARSE_STEP))
         else:
-            flow = AdaptiveFlow(self._generator, duration, TOLERANCE)
+            flow = Flow.adaptive(self._generator, duration, TOLERANCE)
         return Conjugated(flow, limits)
 
     def _evaluate(self, transform: Diffeomorphism, index: Indices, fraction: Array) -> Array:

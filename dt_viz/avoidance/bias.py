@@ -117,7 +117,7 @@ class BiasPoint(Anchored):
         warnings = self._misplaced(motion, nearest, radius)
 
         # a shift carries starts and goal in the region along, and motions with them: then the paper's field acts alone
-        part = 1.0 if at_least == 0 else _rise(ends / max(distance, AIM), 1.0, SMALL)
+        part = 1.0 if at_least == 0 else min(max((ends / max(distance, AIM) - 1) / (SMALL - 1), 0.0), 1.0)
         along = part * tangents.mean(axis=0) * (at_least == 0)
         passing = point._passing(nearest, tangents, along)
         longest = MAX_DURATION if point.strength is None else point.strength
@@ -255,11 +255,6 @@ class BiasPoint(Anchored):
 def _warning(motion: MotionBelow, kind: Kind, text: str) -> MotionWarning:
     """A warning that begins with the name of the bias point, as there may be several."""
     return motion.warning(kind, f"{motion.name}: {text}")
-
-
-def _rise(value: float, low: float, high: float) -> float:
-    """Rise from 0 at a low value to 1 at a high one."""
-    return min(max((value - low) / (high - low), 0.0), 1.0)
 
 
 def _too_small(radius: float, distance: float) -> str:

@@ -18,7 +18,6 @@ NUM_SAMPLES = 400
 KERNEL_WIDTH = 0.4
 """Kernel width of the regression, in radii; about the size of the core in which it smooths the unit vectors, which are
 singular at the target."""
-REGULARISATION = 1e-3
 
 
 @dataclass(frozen=True)
@@ -30,11 +29,6 @@ class RegionField(PointField):
 
     directions: GridRBF
     """V_fit, in R^k."""
-
-    @property
-    def dim(self) -> int:
-        """Dimension of the space."""
-        return 3
 
     def _terms(self) -> Terms:
         return self.directions.grid.terms(self.directions.weights, REGION)
@@ -48,11 +42,6 @@ class Shift(PointField):
     """n, (3,), a unit vector."""
     dim_of_region: int
     """3 for the ball, 2 for the cylinder."""
-
-    @property
-    def dim(self) -> int:
-        """Dimension of the space."""
-        return 3
 
     def _terms(self) -> Terms:
         term = np.zeros(1, TERM)
@@ -81,5 +70,5 @@ def unit_field(dim: int) -> RegionField:
     grid = GaussianGrid.covering(np.stack([-np.ones(dim), np.ones(dim)]), KERNEL_WIDTH, pad=0)
     features = grid.features(samples)
     gram = features.T @ features / len(samples)
-    gram[np.diag_indices_from(gram)] += REGULARISATION
+    gram[np.diag_indices_from(gram)] += 1e-3  # the ridge
     return RegionField(GridRBF(grid, cho_solve(cho_factor(gram), features.T @ away / len(samples))))

@@ -9,9 +9,6 @@ import numpy as np
 from dt_viz.flows.diffeomorphisms import Flow
 from dt_viz.flows.fields import Array, VectorField
 
-ANY = 1e-4
-"""Lack beyond which its size does not matter, where it is only asked whether points are clear."""
-
 Lack = Callable[[Array, float], Array]
 """What points (N, d) lack to be clear, (N,), at most 0 where they are; beyond the given lack, only that."""
 
@@ -25,7 +22,7 @@ def clearing_duration(field: VectorField, points: Array, lack: Lack, step: float
     Returns None where some point is not clear after the longest one.
     """
     duration, before = 0.0, points
-    while (lacking := lack(points, ANY) > 0).any():
+    while (lacking := lack(points, 1e-4) > 0).any():  # whether, not how much
         if duration >= longest:
             return None
         before = points[lacking]

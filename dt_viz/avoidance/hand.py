@@ -14,9 +14,10 @@ from dt_viz.avoidance.clearing import clearing_duration
 from dt_viz.avoidance.detour import Detour, DetourSettings, directions_around
 from dt_viz.avoidance.sideways import Encounter, fixing_ends
 from dt_viz.avoidance.start_status import start_warnings
-from dt_viz.avoidance.transform import Built, MotionBelow, Planar, SidewaysFlow, axes_of
-from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain, Diffeomorphism
+from dt_viz.avoidance.transform import Built, MotionBelow, Planar, axes_of
+from dt_viz.flows.diffeomorphisms import Chain, Diffeomorphism, Flow
 from dt_viz.flows.fields import Array, Mask, Projected, VectorField
+from dt_viz.metrics import arc_length
 from dt_viz.obstacles.shapes import Obstacle, Point
 from dt_viz.obstacles.union import Union, escape_lengths
 from dt_viz.warning import Kind, MotionWarning, in_millimetres
@@ -92,7 +93,7 @@ class HandAvoidance(Avoidance, Planar, space="task"):
         spent = sum(flow.duration for flow in sideways)
         at_least = max(0.0, motion.at_least - spent)
         if sideways and motion.earlier is not None:
-            last = self.integration.of(AdaptiveFlow(field, at_least, motion.tolerance))
+            last = self.integration.of(Flow.adaptive(field, at_least, motion.tolerance))
             motion = replace(
                 motion, positions=Chain([fixing_ends(first, last) for first in sideways]).inverse(motion.positions)
             )
@@ -103,7 +104,7 @@ class HandAvoidance(Avoidance, Planar, space="task"):
         if duration is None:
             points, margin = motion.positions[self._avoidable(motion)], self._kept_margin(motion)
             if at_least > 0:
-                points = AdaptiveFlow(field, at_least, TOLERANCE).inverse(points)
+                points = Flow.adaptive(field, at_least, TOLERANCE).inverse(points)
             more = clearing_duration(
                 field, points, lambda s, _: margin - obstacle.signed_distance(s), SNAPSHOT, MAX_DURATION - at_least
             )
@@ -112,13 +113,13 @@ class HandAvoidance(Avoidance, Planar, space="task"):
             hopeless = duration is None or (self.integration.by_hand and 0 < duration <= at_least)
             if duration is None:
                 duration = MAX_DURATION
-                carried = AdaptiveFlow(field, duration, TOLERANCE).inverse(points)
+                carried = Flow.adaptive(field, duration, TOLERANCE).inverse(points)
                 if obstacle.signed_distance(carried).min() < 0:
                     flat = self.generator == "probability"
                     why = "∇p is flat inside it" if flat else "it runs through its dead centre"
                     text = f"a motion does not leave the obstacle: {why}"
                     warnings.append(motion.warning(Kind.STAYS_INSIDE, text))
-        flow: Diffeomorphism = self.integration.of(AdaptiveFlow(field, duration, motion.tolerance))
+        flow: Diffeomorphism = self.integration.of(Flow.adaptive(field, duration, motion.tolerance))
         if sideways:
             flow = Chain([*(fixing_ends(first, flow) for first in sideways), flow])
         goal = self._nearest_free(motion.goal) if motion.keeps_goal else flow.inverse(motion.goal)
@@ -130,7 +131,7 @@ class HandAvoidance(Avoidance, Planar, space="task"):
         chosen = {"duration": duration}
         return Built(flow, duration, goal, hopeless, tuple(warnings), self.integration, chosen, detours, sideways)
 
-    def _sideways(self, motion: MotionBelow) -> tuple[tuple[Detour | None, ...], tuple[SidewaysFlow, ...], MotionBelow]:
+    def _sideways(self, motion: MotionBelow) -> tuple[tuple[Detour | None, ...], tuple[Flow, ...], MotionBelow]:
         """Return detours around the obstacles, the flows that carry all motions to one side of each, and these there.
 
         Further attempts take those of the first, with the motion before them: for starts that the flows have moved into
@@ -141,7 +142,7 @@ class HandAvoidance(Avoidance, Planar, space="task"):
         if motion.earlier is not None:
             return motion.earlier.detours, motion.earlier.sideways, motion
         detours: list[Detour | None] = [None] * len(self.obstacles)
-        sideways: list[SidewaysFlow] = []
+        sideways: list[Flow] = []
         if self.generator == "probability":
             return tuple(detours), (), motion
         plane = None if self.plane is None else axes_of(self.plane)[:, :2]
@@ -228,7 +229,7 @@ class HandAvoidance(Avoidance, Planar, space="task"):
                 avoidable[rows[: outside[0] if len(outside) else None]] = False
             if goal_covered:
                 path = motion.positions[rows]
-                to_end = np.append(np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1)[::-1])[::-1], 0)
+                to_end = arc_length(path[::-1])[::-1]
                 tail = to_end <= TAIL * np.linalg.norm(path[-1] - instead) + BESIDE
                 tail[: outside[-1] + 1 if len(outside) else 0] = False
                 avoidable[rows[tail]] = False

@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from dt_viz.flows.fields import Array, Indices, Mask
@@ -54,7 +52,7 @@ class Lift:
 
     def along(self, rollout: int) -> TrackedPath:
         """The joints along one of the rollouts: its q has shape (T, n)."""
-        return TrackedPath(*(values[rollout] for values in _fields(self.tracked)))
+        return TrackedPath(**{name: values[rollout] for name, values in vars(self.tracked).items()})
 
     @cached_property
     def pins(self) -> Array:
@@ -65,13 +63,9 @@ class Lift:
     @classmethod
     def of(cls, lifts: Sequence[Lift], moving: Mask, shaping: Mask) -> Lift:
         """The rollouts of several, one after the other, with the reference of the first."""
-        tracked = zip(*(_fields(part.tracked) for part in lifts), strict=True)
+        tracked = zip(*(vars(part.tracked).values() for part in lifts), strict=True)
         fractions = np.concatenate([part.fractions for part in lifts])
         return cls(fractions, TrackedPath(*map(np.concatenate, tracked)), lifts[0].reference, moving, shaping)
-
-
-def _fields(tracked: TrackedPath) -> tuple[NDArray[Any], ...]:
-    return tracked.q, tracked.error, tracked.limits_hit, tracked.manipulability, tracked.damped, tracked.turned
 
 
 def lift(

@@ -18,10 +18,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dt_viz.avoidance.detour import Detour, DetourSettings, escape_directions
-from dt_viz.avoidance.transform import MotionBelow, SidewaysFlow
-from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Diffeomorphism
+from dt_viz.avoidance.transform import MotionBelow
+from dt_viz.flows.diffeomorphisms import Diffeomorphism, Flow
 from dt_viz.flows.fields import Array, Mask, PointField
 from dt_viz.kernels.fields import ASIDE, TERM, Terms
+from dt_viz.numerics import unit
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.union import Union, escape_lengths
 
@@ -59,11 +60,6 @@ class Sideways(PointField):
     radii: Array
     """ρ_e, (E,), metres."""
 
-    @property
-    def dim(self) -> int:
-        """Dimension of the space."""
-        return 3
-
     def _terms(self) -> Terms:
         term, ends = np.zeros(1, TERM), np.column_stack([self.ends, self.radii])
         values = np.concatenate([self.centre, self.inverse.ravel(), ends.ravel()]).astype(np.float64)
@@ -72,7 +68,7 @@ class Sideways(PointField):
         return Terms(term, values)
 
 
-def fixing_ends(flow: SidewaysFlow, outer: Diffeomorphism) -> SidewaysFlow:
+def fixing_ends(flow: Flow, outer: Diffeomorphism) -> Flow:
     """The flow to a side, zero not at its ends but at their images under `outer`, which is stacked on it.
 
     So `outer` alone moves the ends. Where it brought them into the field, that would carry them far into the obstacle.
@@ -117,8 +113,7 @@ class Encounter:
         of_next = motion.index[np.minimum(inside + 1, len(motion.index) - 1)] == motion.index[inside]
         of_last = motion.index[np.maximum(inside - 1, 0)] == motion.index[inside]
         after, before = (np.clip(inside + by, 0, len(motion.index) - 1) for by in (of_next, -1 * of_last))
-        tangents = motion.positions[after] - motion.positions[before]
-        tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
+        tangents = unit(motion.positions[after] - motion.positions[before])
         ends = np.concatenate([motion.starts, motion.goal[None]])
         ends = ends[obstacle.signed_distance(ends) >= 0]
         return cls(obstacle, margin, motion.positions[inside], tangents, ends, tuple(others), plane)
@@ -149,7 +144,7 @@ class Encounter:
     def _measured(self, detour: Detour) -> Detour:
         return replace(detour, length=float(self._lengths(detour.direction).max()))
 
-    def flow(self, direction: Array, tolerance: float) -> AdaptiveFlow:
+    def flow(self, direction: Array, tolerance: float) -> Flow:
         """The flow whose inverse carries all samples along a unit vector (3,) until they keep the margin."""
         length = self._lengths(direction)
         ellipsoid = self.obstacle.field("free-space", 1.0)  # with half axes as columns, metres, about as large
@@ -163,7 +158,7 @@ class Encounter:
         passed = self.points + (np.linspace(0, 1, len(SIMPSON))[:, None] * length)[:, :, None] * direction
         speed = -(field(passed.reshape(-1, 3)) @ direction).reshape(len(SIMPSON), -1)
         duration = length * (SIMPSON @ (1 / np.maximum(speed, SLOWEST * gain)))
-        return AdaptiveFlow(field, min(float(duration.max()), LONGEST), tolerance)
+        return Flow.adaptive(field, min(float(duration.max()), LONGEST), tolerance)
 
     def _lengths(self, direction: Array) -> Array:
         """Lengths (K,), metres, by which the samples are displaced along a unit vector (3,) to keep the margin."""

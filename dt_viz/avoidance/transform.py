@@ -13,7 +13,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from dt_viz.avoidance.detour import Detour
-from dt_viz.flows.diffeomorphisms import AUTO, AdaptiveFlow, Diffeomorphism, Flow, Integration
+from dt_viz.flows.diffeomorphisms import AUTO, Diffeomorphism, Flow, Integration
 from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.obstacles.shapes import Point
 from dt_viz.obstacles.union import Union
@@ -21,8 +21,6 @@ from dt_viz.warning import Kind, MotionWarning
 
 MOST_DURATION = 100.0
 """Longest flow time that a transform may have."""
-SidewaysFlow = AdaptiveFlow | Flow
-"""Flow in one direction out of an obstacle; see `dt_viz.avoidance.sideways`."""
 
 
 @dataclass(frozen=True)
@@ -95,8 +93,8 @@ class Built:
     """Values that were chosen automatically, by the transform's fields."""
     detours: tuple[Detour | None, ...] = field(default=(), compare=False)
     """Detours around the obstacles that it avoids; None of those that are not in the way."""
-    sideways: tuple[SidewaysFlow, ...] = field(default=(), compare=False)
-    """Flows along these, which come before its own."""
+    sideways: tuple[Flow, ...] = field(default=(), compare=False)
+    """Flows along these, which come before its own; see `dt_viz.avoidance.sideways`."""
 
 
 @lru_cache(maxsize=64)

@@ -7,7 +7,7 @@ rollout is one pass of ψ⁻¹ along a ray, and its times are the integral of 1/
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +62,7 @@ def num_of(coordinates: slice, dim: int) -> int:
 class Coupling(Diffeomorphism):
     """Affine coupling layer y_b = x_b·exp(s(x_a)) + t(x_a), y_a = x_a; s and t are sums of cosines cos(Wᵀx_a + φ)."""
 
+    SCALED = ("amplitudes", "slopes")  # s and t in proportion: not a group, as that of a flow is
     given: slice
     """Coordinates a that s and t read."""
     moved: slice
@@ -86,10 +87,6 @@ class Coupling(Diffeomorphism):
     @property
     def dim(self) -> int:
         return len(self.frequencies) - 1 + self.amplitudes.shape[1] // 2
-
-    def scaled(self, fraction: float) -> Coupling:
-        """The layer with s and t in proportion; not a group, as that of a flow is."""
-        return replace(self, amplitudes=fraction * self.amplitudes, slopes=fraction * self.slopes)
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         a, b, num = self.given, self.moved, self.amplitudes.shape[1] // 2
@@ -125,7 +122,7 @@ class Coupling(Diffeomorphism):
 
 @dataclass(frozen=True, eq=False)
 class Normalisation(Diffeomorphism):
-    """The affine map y ↦ scale·y + shift, coordinate by coordinate."""
+    """The affine map y ↦ scale·y + shift, coordinate by coordinate: a change of units, never scaled."""
 
     scale: Array
     shift: Array
@@ -133,10 +130,6 @@ class Normalisation(Diffeomorphism):
     @property
     def dim(self) -> int:
         return len(self.scale)
-
-    def scaled(self, fraction: float) -> Normalisation:
-        """Itself: it is a change of units, no behaviour."""
-        return self
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         scale = 1 / self.scale if inverse else self.scale

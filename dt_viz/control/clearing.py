@@ -14,7 +14,7 @@ import numpy as np
 
 from dt_viz.avoidance.arm import WholeArm
 from dt_viz.avoidance.arm_field import WholeArmField
-from dt_viz.avoidance.arm_solver import MAX_DURATION, ROUNDING, SLOPE
+from dt_viz.avoidance.arm_solver import MARGIN_TOLERANCE, MAX_DURATION, SLOPE
 from dt_viz.avoidance.arm_solver import clearing as clearing_time
 from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.avoidance.detour import escape_directions, turned
@@ -170,7 +170,7 @@ def lack(arm: WholeArm, p: Array, avoidance: ArmAvoidance, end: Array | None, mo
     That is the margin, or beside a free posture `end` (n,) that has less itself, what it has.
     """
     pins = p[:0] if end is None else end[None]
-    room = arm.clearance(pins, avoidance.avoided) - ROUNDING
+    room = arm.clearance(pins, avoidance.avoided) - MARGIN_TOLERANCE
     pins, room = pins[room > 0], room[room > 0]
     asked = room_asked(np.array(p, order="C"), pins, room, np.array(arm.robot.levers), SLOPE, float(avoidance.margin))
     return asked - arm.clearance(p, avoidance.avoided, asked + arm.settings.speed * STEP, asked - most)

@@ -12,9 +12,6 @@ from dt_viz.kernels.proximity import COMPLEX_STEP
 from dt_viz.robot.inverse_kinematics import soft_limits, track
 from dt_viz.robot.robot import Robot
 
-NUM_POLISHING = 4
-"""Number of Newton steps from the result of `track` to the exact best posture; they converge quadratically."""
-
 
 @dataclass(frozen=True, eq=False)
 class Section:
@@ -42,7 +39,7 @@ class Section:
         start = np.broadcast_to(self.reference, (*x.shape[:-2], n))
         q = track(self.robot, x, start, reference=start).q.reshape(-1, n)
         targets = x.reshape(-1, 3)
-        for _ in range(NUM_POLISHING):
+        for _ in range(4):  # Newton steps to the exact best posture; they converge quadratically
             slope, K = self._derivatives(q)
             miss = np.concatenate([-slope, targets - self.robot.end_effector(q)], axis=1)
             q = q + np.linalg.solve(K, miss[..., None])[:, :n, 0]

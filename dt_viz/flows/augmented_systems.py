@@ -10,7 +10,7 @@ place is another state. Augmented states are the paper's outlook (sec. 6).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -92,6 +92,7 @@ class Predictions(Protocol):
 class Shear(Diffeomorphism):
     """(y, s, a) ↦ (y − c(s; a), s, a); its Jacobian has determinant 1 everywhere."""
 
+    SCALED = ("amount",)
     predictions: Predictions
     """They give c."""
     amount: float = 1.0
@@ -100,9 +101,6 @@ class Shear(Diffeomorphism):
     @property
     def dim(self) -> int:
         return self.predictions.dim + 1 + self.predictions.num_conditions
-
-    def scaled(self, fraction: float) -> Shear:
-        return replace(self, amount=fraction * self.amount)
 
     def at(self, rest: Array) -> Translation:
         """The map of places at one phase and for one condition, `rest` (1 + c,)."""
@@ -127,15 +125,13 @@ class Shear(Diffeomorphism):
 class Translation(Diffeomorphism):
     """y ↦ y + shift."""
 
+    SCALED = ("shift",)
     shift: Array
     """(d,), metres."""
 
     @property
     def dim(self) -> int:
         return len(self.shift)
-
-    def scaled(self, fraction: float) -> Translation:
-        return Translation(fraction * self.shift)
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         return (s - self.shift if inverse else s + self.shift), None if U is None else U.copy()
@@ -145,6 +141,7 @@ class Translation(Diffeomorphism):
 class OnPlaces(Diffeomorphism):
     """A diffeomorphism of places as one of states, (y, s, a) ↦ (ψ(y), s, a), so that it can be stacked on a shear."""
 
+    SCALED = ("transform",)
     transform: Diffeomorphism
     """ψ."""
     num_rest: int
@@ -154,18 +151,11 @@ class OnPlaces(Diffeomorphism):
     def dim(self) -> int:
         return self.transform.dim + self.num_rest
 
-    def scaled(self, fraction: float) -> OnPlaces:
-        return replace(self, transform=self.transform.scaled(fraction))
-
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         d = self.transform.dim
-        place, rest = s[:, :d], s[:, d:]
-        if U is None:
-            image = self.transform.inverse(place) if inverse else self.transform.forward(place)
-            return np.concatenate([image, rest], axis=1), None
-        tangents = self.transform.inverse_tangents if inverse else self.transform.forward_tangents
-        image, V = tangents(place, U[:, :d])
-        return np.concatenate([image, rest], axis=1), np.concatenate([V, U[:, d:]], axis=1)
+        image, V = self.transform._map(s[:, :d], None if U is None else U[:, :d], inverse=inverse)
+        image = np.concatenate([image, s[:, d:]], axis=1)
+        return image, None if U is None or V is None else np.concatenate([V, U[:, d:]], axis=1)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, TypeVar
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -17,11 +17,15 @@ from dt_viz.flows.fields import Array, VectorField
 from dt_viz.flows.integrators import DORMAND_PRINCE, EULER, RK4, carried
 
 
+@dataclass(frozen=True, eq=False)
 class Diffeomorphism(ABC):
     """A smooth bijection of R^d with smooth inverse.
 
-    A subclass defines `_map` for both directions, and `scaled`; everything else follows. Points have shape (*B, d).
+    A subclass defines `dim`, and `_map` for both directions; everything else follows. Points have shape (*B, d).
     """
+
+    SCALED: ClassVar[tuple[str, ...]] = ()
+    """Names of the fields that `scaled` scales: numbers, arrays and transforms. Without any, a transform stays."""
 
     @property
     @abstractmethod
@@ -32,12 +36,15 @@ class Diffeomorphism(ABC):
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         """Image of points `s` (N, d) under ψ or ψ⁻¹, and of tangents `U` (N, d, k) under its derivative."""
 
-    @abstractmethod
     def scaled(self, fraction: float) -> Diffeomorphism:
         """The transform between the identity (fraction 0) and ψ (1): each flow runs for a fraction of its duration.
 
         A flow becomes γ(fraction·t, ·), so scaled(a)∘scaled(b) = scaled(a + b), and a chain that of its scaled parts.
+        The number of steps stays, so an exact inverse stays exact.
         """
+        whole = {name: getattr(self, name) for name in self.SCALED}
+        parts = {k: v.scaled(fraction) if isinstance(v, Diffeomorphism) else fraction * v for k, v in whole.items()}
+        return replace(self, **parts) if parts else self
 
     def forward(self, y: Array) -> Array:
         """ψ(y), (*B, d)."""
@@ -84,6 +91,7 @@ class Diffeomorphism(ABC):
 class Flow(Diffeomorphism):
     """ψ(y) = γ(t, y), the solution at time t of ṡ = V(s), s(0) = y; ψ⁻¹(x) = γ(−t, x) (sec. 4.2)."""
 
+    SCALED = ("duration",)
     field: VectorField
     duration: float = 1.0
     steps: int = 8
@@ -91,14 +99,21 @@ class Flow(Diffeomorphism):
     """Method of `dt_viz.flows.integrators`."""
     inverse_method: int | None = None
     """Method for ψ⁻¹; None takes `method`. `IMPLICIT_EULER` with `EULER` gives an inverse exact to rounding."""
+    tolerance: float = 0.0
+    """Largest estimated error of an adaptive step of the points, in their unit. Tangents obey `TANGENT_TOLERANCE`
+    instead: where space is squeezed strongly, det J may be off by some per cent."""
+
+    @classmethod
+    def adaptive(cls, field: VectorField, duration: float, tolerance: float = 1e-8) -> Flow:
+        """Make the flow with steps for each point by itself, so long that they keep the tolerance.
+
+        For fields that are steep in a small core and flat elsewhere, such as those of obstacles.
+        """
+        return cls(field, duration, MOST_STEPS, DORMAND_PRINCE, tolerance=tolerance)
 
     @property
     def dim(self) -> int:
         return self.field.dim
-
-    def scaled(self, fraction: float) -> Flow:
-        """The number of steps stays, so an exact inverse stays exact."""
-        return replace(self, duration=fraction * self.duration)
 
     def min_step_determinant(self, s: Array, *, inverse: bool) -> float:
         """Smallest det of the derivative of a step of ψ from points `s` (N, d), or of ψ⁻¹.
@@ -113,32 +128,8 @@ class Flow(Diffeomorphism):
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         method = self.method if self.inverse_method is None or not inverse else self.inverse_method
-        return carried(self.field, s, U, method, -self.duration if inverse else self.duration, self.steps)
-
-
-@dataclass(frozen=True)
-class AdaptiveFlow(Diffeomorphism):
-    """The flow of `Flow`, each point integrated with steps of its own length to a tolerance.
-
-    For fields that are steep in a small core and flat elsewhere, such as those of obstacles.
-    """
-
-    field: VectorField
-    duration: float
-    tolerance: float = 1e-8
-    """Largest estimated error of a step of the points, in their unit. Tangents obey `TANGENT_TOLERANCE` instead: where
-    space is squeezed strongly, det J may be off by some per cent."""
-
-    @property
-    def dim(self) -> int:
-        return self.field.dim
-
-    def scaled(self, fraction: float) -> AdaptiveFlow:
-        return replace(self, duration=fraction * self.duration)
-
-    def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         duration = -self.duration if inverse else self.duration
-        return carried(self.field, s, U, DORMAND_PRINCE, duration, MOST_STEPS, self.tolerance)
+        return carried(self.field, s, U, method, duration, self.steps, self.tolerance)
 
 
 @dataclass(frozen=True, init=False)
@@ -176,9 +167,6 @@ class Identity(Diffeomorphism):
     def dim(self) -> int:
         return self.dimension
 
-    def scaled(self, fraction: float) -> Identity:
-        return self
-
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         return s, U
 
@@ -187,6 +175,7 @@ class Identity(Diffeomorphism):
 class Conjugated(Diffeomorphism):
     """h⁻¹∘ψ∘h: ψ acts in the coordinates h(y). Scaling it scales ψ and leaves the coordinates as they are."""
 
+    SCALED = ("inner",)
     inner: Diffeomorphism
     """ψ."""
     by: Diffeomorphism
@@ -195,9 +184,6 @@ class Conjugated(Diffeomorphism):
     @property
     def dim(self) -> int:
         return self.by.dim
-
-    def scaled(self, fraction: float) -> Conjugated:
-        return replace(self, inner=self.inner.scaled(fraction))
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         s, U = self.by._map(s, U, inverse=False)
@@ -213,6 +199,7 @@ class Placed(Diffeomorphism):
     how a motion learned in a drawing plane becomes a motion of the robot's hand.
     """
 
+    SCALED = ("inner",)
     inner: Diffeomorphism
     origin: Array
     """o, (d,), metres."""
@@ -233,9 +220,6 @@ class Placed(Diffeomorphism):
         """Frame coordinates (*B, d) of world points (*B, d)."""
         return (y - self.origin) @ self.axes / self.scale
 
-    def scaled(self, fraction: float) -> Placed:
-        return replace(self, inner=self.inner.scaled(fraction))
-
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         k = self.inner.dim
         u = self.to_frame(s)
@@ -253,9 +237,6 @@ MAX_STEPS, MOST_STEPS = 50, 1000
 """Largest numbers of steps of a flow: on the page, and at all."""
 
 
-_Flow = TypeVar("_Flow", bound=Flow | AdaptiveFlow)
-
-
 @dataclass(frozen=True)
 class Integration:
     """A method and, where it is not `auto`, its number of steps. Raises FormatError on another number of them."""
@@ -271,7 +252,7 @@ class Integration:
         """Whether the user chose the steps, so that no tolerance is guaranteed."""
         return self.method != "auto"
 
-    def of(self, flow: _Flow) -> _Flow | Flow:
+    def of(self, flow: Flow) -> Flow:
         """The flow integrated by this method; `auto` leaves `flow` as it is."""
         if self.method == "auto":
             return flow

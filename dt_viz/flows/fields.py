@@ -41,9 +41,9 @@ class PointField(ABC):
     """A vector field of the plane or of space that compiled loops know; everything follows from its `terms`."""
 
     @property
-    @abstractmethod
     def dim(self) -> int:
-        """Dimension d of the space."""
+        """Dimension d of the space, 3 if nothing else is said."""
+        return 3
 
     @abstractmethod
     def _terms(self) -> Terms:

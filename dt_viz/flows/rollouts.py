@@ -9,6 +9,7 @@ import numpy as np
 
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.systems import Attractor
+from dt_viz.metrics import arc_length
 
 ARRIVED = 1e-4
 """Distance (m) from the goal in base space at which a motion counts as arrived."""
@@ -93,10 +94,10 @@ def evenly_sampled(evaluate: Evaluate, num_rollouts: int, num_samples: int) -> B
     trial = np.linspace(0, 1, 2 * num_samples)
     index = np.repeat(np.arange(num_rollouts), len(trial))
     paths = evaluate(index, np.tile(trial, num_rollouts))[:, -1].reshape(num_rollouts, len(trial), -1)
-    lengths = np.cumsum(np.linalg.norm(np.diff(paths, axis=1), axis=2), axis=1)
+    lengths = arc_length(paths)
     even = np.linspace(0, 1, num_samples)
     fraction = np.concatenate(
-        [np.interp(even, np.r_[0, length] / length[-1], trial) if length[-1] > 0 else even for length in lengths]
+        [np.interp(even, length / length[-1], trial) if length[-1] > 0 else even for length in lengths]
     )
     index = np.repeat(np.arange(num_rollouts), num_samples)
     return Bundle(index, fraction, evaluate(index, fraction))

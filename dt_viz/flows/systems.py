@@ -81,12 +81,10 @@ class Attractor:
 
     def flow(self, z0: Array, times: Array) -> Array:
         """z(t), (*B, T, d), from `z0` (*B, d) at `times` (T,) or (*B, T) in seconds, in closed form."""
-        offset = z0 - self.goal
-        r0 = np.linalg.norm(offset, axis=-1, keepdims=True)
+        r0 = np.linalg.norm(z0 - self.goal, axis=-1, keepdims=True)
         clock = log_sinh(r0 / self.smoothing) - self.speed * times / self.smoothing  # (*B, T)
         r = self.smoothing * asinh_exp(clock)
-        shrink = np.divide(r, r0, out=np.zeros_like(r), where=r0 > 0)
-        return self.goal + shrink[..., None] * offset[..., None, :]
+        return self.at_fraction(z0, np.divide(r, r0, out=np.zeros_like(r), where=r0 > 0))
 
     def at_fraction(self, z0: Array, fraction: Array) -> Array:
         """Points (*B, T, d) of motions from `z0` (*B, d) where a `fraction` (*B, T) of their way is left."""

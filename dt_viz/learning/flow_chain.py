@@ -20,9 +20,6 @@ from dt_viz.flows.diffeomorphisms import Chain, Flow
 from dt_viz.flows.fields import Array, GaussianGrid, GridRBF
 from dt_viz.flows.integrators import EULER, IMPLICIT_EULER
 
-JITTER = 1e-4  # diagonal added to the kernel matrix, since overlapping Gaussians are nearly dependent
-ROUNDING = 1e-9  # part of a distance by which inducing points on the edge of the reach, as in even data, count as near
-
 
 @dataclass(frozen=True)
 class FlowLayer:
@@ -43,7 +40,8 @@ class FlowLayer:
         """
         grid = GaussianGrid.covering(points, sigma, spacing=spacing, pad=reach)
         distance, _ = KDTree(points).query(grid.inducing_points)
-        farthest = max(reach, 0.5 * spacing * np.sqrt(grid.dim)) * sigma * (1 + ROUNDING)
+        # points on the edge of the reach, as in even data, count as near
+        farthest = max(reach, 0.5 * spacing * np.sqrt(grid.dim)) * sigma * (1 + 1e-9)
         return cls.of(grid, np.flatnonzero(distance <= farthest))
 
     @classmethod
@@ -53,7 +51,7 @@ class FlowLayer:
             active = np.arange(grid.num_points)
         centres = grid.inducing_points[active]
         gram = np.exp(-grid.ell * ((centres[:, None] - centres) ** 2).sum(axis=-1))
-        lower = cholesky(gram + JITTER * np.eye(len(active)), lower=True)
+        lower = cholesky(gram + 1e-4 * np.eye(len(active)), lower=True)  # overlapping Gaussians are nearly dependent
         return cls(grid, active, solve_triangular(lower, np.eye(len(active)), lower=True).T)
 
     @property

@@ -41,8 +41,6 @@ Objective = Literal["trajectory", "velocity"]
 """Objective of a fit: the rollouts themselves, or the velocities at the demonstrations' points (eq. (3))."""
 OBJECTIVES: tuple[Objective, ...] = get_args(Objective)
 
-EVEN = 1e-9  # largest difference of successive distances between inducing points, relative to their coordinates
-
 
 @dataclass(frozen=True)
 class ImitationSettings:
@@ -152,7 +150,7 @@ class Imitation(AnyImitation):
             axes = tuple(_finite(arrays, f"{prefix}axis_{j}", None) for j in range(d))
             grid = GaussianGrid(axes, float(ell))
             for j, nodes in enumerate(axes):
-                if np.abs(np.diff(nodes, 2)).max(initial=0) > EVEN * np.abs(nodes).max():
+                if np.abs(np.diff(nodes, 2)).max(initial=0) > 1e-9 * np.abs(nodes).max():
                     raise FormatError(f"{prefix}axis_{j}", "uneven distances", "evenly spaced numbers")
             if not (ell > 0 and 1 <= steps <= MOST_STEPS and forward in (0, 1)):
                 found = f"ℓ = {ell:g} and {steps:g} steps"

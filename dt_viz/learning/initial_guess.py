@@ -24,12 +24,10 @@ from scipy.spatial.transform import Rotation
 
 from dt_viz.flows.fields import Array
 from dt_viz.learning.flow_chain import FlowChain, FlowLayer
+from dt_viz.numerics import unit
 
 SMOOTHING = 0.04  # width of the filter for tangents, as a fraction of the motion; half of it to find what winds
-MAX_TURN = (
-    np.pi
-)  # turning from its middle from which a motion winds; none in the plane that always advances turns as far
-BLUNT, MEDIAN_ITERATIONS = 0.1, 50  # rounding, rad, of the geometric median of all turning, and iterations for it
+BLUNT = 0.1  # rounding, rad, of the geometric median of all turning
 MIN_ADVANCE = 0.1  # advance along the axis, in parts of its way, that each step of what is sheared makes
 APART = 0.8  # mean distance, in spreads, below which motions belong to one group
 
@@ -113,7 +111,7 @@ def _axis(mean: Array) -> Array | None:
     """
     tangents = _tangents(_solid(mean), SMOOTHING / 2)  # smoothed as much as usual, four turns would hardly be left
     turned, _ = _turned(tangents)
-    if np.linalg.norm(turned - _middle(turned), axis=1).max() < MAX_TURN:
+    if np.linalg.norm(turned - _middle(turned), axis=1).max() < np.pi:  # what always advances in the plane turns less
         return None
     weights, _ = nnls(np.vstack([tangents.T, np.ones(len(tangents))]), np.array([0.0, 0.0, 0.0, 1.0]))
     axis = tangents.T @ weights / weights.sum()
@@ -123,8 +121,7 @@ def _axis(mean: Array) -> Array | None:
 
 def _tangents(mean: Array, smoothing: float) -> Array:
     """Compute unit tangents (n, d) of a motion, smoothed over a part of it."""
-    tangents = np.gradient(gaussian_filter1d(mean, smoothing * len(mean), axis=0, mode="nearest"), axis=0)
-    return tangents / np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
+    return unit(np.gradient(gaussian_filter1d(mean, smoothing * len(mean), axis=0, mode="nearest"), axis=0))
 
 
 def _middle(turned: Array) -> Array:
@@ -134,7 +131,7 @@ def _middle(turned: Array) -> Array:
     elements of a motion in the plane tie for, it is a continuous function of the motion.
     """
     middle = turned.mean(axis=0)
-    for _ in range(MEDIAN_ITERATIONS):
+    for _ in range(50):
         weights = 1.0 / np.sqrt(((turned - middle) ** 2).sum(axis=1) + BLUNT**2)
         middle = weights @ turned / weights.sum()
     return middle

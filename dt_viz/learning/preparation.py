@@ -17,8 +17,6 @@ from dt_viz.learning.inspection import Inspection, PreparationSettings, Repaired
 from dt_viz.metrics import arc_length, discrete_frechet, resample_by_arc_length
 from dt_viz.warning import in_metres, in_millimetres
 
-DECIDING = 1e-3  # deviation that points are given along a way, in spreads, to decide between axes that are alike
-
 
 class ImitationError(ValueError):
     """Demonstrations from which no stable system can be learned; the message names the demonstration and the reason."""
@@ -94,7 +92,7 @@ class Motions:
 
         Where these scatter alike to all sides, or not at all, a `way` (d,) decides, not rounding.
         """
-        along = DECIDING * self.spread * way / max(float(np.linalg.norm(way)), 1e-12 * self.spread)
+        along = 1e-3 * self.spread * way / max(float(np.linalg.norm(way)), 1e-12 * self.spread)
         return np.linalg.eigh(np.cov(points, rowvar=False, bias=True) + np.outer(along, along))[1]
 
     @property

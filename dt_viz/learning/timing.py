@@ -70,8 +70,7 @@ class TimedAttractor(Attractor):
         paces = self._blended(offset)
         togo = self._time_to_go(self._clock(r0), paces) - times  # (*B, T)
         r = self.smoothing * asinh_exp(self._clock_at(togo, paces) * self.speed / self.smoothing)
-        shrink = np.divide(r, r0, out=np.zeros_like(r), where=r0 > 0)
-        return self.goal + shrink[..., None] * offset[..., None, :]
+        return self.at_fraction(z0, np.divide(r, r0, out=np.zeros_like(r), where=r0 > 0))
 
     def times_at(self, z0: Array, distances: Array) -> Array:
         offset = z0 - self.goal

@@ -15,8 +15,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from dt_viz.flows.fields import Array
 from dt_viz.learning.flow_chain import FlowChain
-
-IMAGE_PRIOR = 1e-7  # damping of the images of the rays' ends, which could otherwise drift
+from dt_viz.numerics import unit
 
 
 @dataclass(frozen=True)
@@ -39,8 +38,7 @@ class TrajectoryFit:
     def weights(self) -> Array:
         """Return the matrices (R, n, d, d) that weight the residual vectors."""
         d = self.chain.dim
-        tangents = np.gradient(self.targets, axis=1)
-        tangents /= np.maximum(np.linalg.norm(tangents, axis=-1, keepdims=True), 1e-12)
+        tangents = unit(np.gradient(self.targets, axis=1))
         weights = np.eye(d) - (1 - self.along_weight) * tangents[..., :, None] * tangents[..., None, :]
         weights[:, [0, -1]] = self.end_weight * np.eye(d)
         return np.sqrt(self.importance / self.importance.mean())[:, None, None, None] * weights
@@ -83,7 +81,8 @@ class TrajectoryFit:
             before, accepted = cost, False
             for _ in range(12):
                 extra = damping * self.regularisation
-                step = system.solve(gradient, self.regularisation + extra, IMAGE_PRIOR + extra)
+                # without any damping the images of the rays' ends could drift
+                step = system.solve(gradient, self.regularisation + extra, 1e-7 + extra)
                 if step is None:
                     damping *= 8
                     continue

@@ -13,10 +13,11 @@ from functools import cached_property
 
 import numpy as np
 
-from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Diffeomorphism
+from dt_viz.flows.diffeomorphisms import Conjugated, Diffeomorphism, Flow
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.rollouts import ARRIVED
 from dt_viz.flows.rotations import apart
+from dt_viz.motion.following import MAX_TRACKING_ERROR
 from dt_viz.motion.stack import Solution
 from dt_viz.robot.collision import CollisionReport
 from dt_viz.robot.robot import Robot
@@ -33,7 +34,7 @@ MAX_OFF_POSTURE = 1e-5
 millimetres are 4e-4 where it squeezes most."""
 POSTURE_TOLERANCE = 1e-7
 """Tolerance of a step of ψ_q's flow, rad, at every posture: half as costly as the one that the motion is made with."""
-MAX_OFF_TRACKED = 1e-3
+MAX_OFF_TRACKED = MAX_TRACKING_ERROR
 """`MAX_OFF` where the hand follows the motion by the joints: a spline between postures on it leaves up to 1e-5, joints
 at their limits leave more."""
 RESOLVED = 1e-5
@@ -71,7 +72,7 @@ class Certificates:
     min_det_jacobian: float | None = None
     """Smallest det J of the whole stack along the rollouts: positive where it is a diffeomorphism. Where ψ⁻¹,
     integrated by hand, folds what is drawn, its det is taken. It is as exact as tangents are: where space is squeezed
-    strongly, off by some per cent (see `AdaptiveFlow.tolerance`)."""
+    strongly, off by some per cent (see `Flow.tolerance`)."""
     round_trip_error: float | None = None
     """Largest ‖ψ⁻¹(ψ(y)) − y‖ along the rollouts, metres."""
     lyapunov_falls: bool | None = None
@@ -203,7 +204,7 @@ def _falls(distance: Array, shown: DrawnSamples) -> bool:
 
 def _quicker(transform: Diffeomorphism) -> Diffeomorphism:
     """ψ_q with its flow integrated to `POSTURE_TOLERANCE`."""
-    if isinstance(transform, Conjugated) and isinstance(transform.inner, AdaptiveFlow):
+    if isinstance(transform, Conjugated) and isinstance(transform.inner, Flow) and transform.inner.tolerance:
         return replace(transform, inner=replace(transform.inner, tolerance=POSTURE_TOLERANCE))
     return transform
 

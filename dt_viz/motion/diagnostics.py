@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from dt_viz.avoidance.arm_solver import MARGIN_TOLERANCE
 from dt_viz.avoidance.start_status import StartStatus, start_warnings
 from dt_viz.avoidance.transform import Anchored, MotionBelow
 from dt_viz.flows.diffeomorphisms import Chain, Conjugated, Diffeomorphism, Flow, Integration
@@ -24,8 +25,6 @@ from dt_viz.warning import ARM, Kind, MotionWarning, in_millimetres
 
 MAX_GOAL_MISS = 1e-3
 """Distance beside the goal at which motions may end before it is said, metres."""
-MARGIN_TOLERANCE = 1e-3
-"""Distance by which the arm's meshes may come nearer to the obstacle than the margin before it is said, metres."""
 NUM_CHECKED_LIVE = 300
 """Number of samples on which it is computed what an integrator costs that was chosen by hand."""
 
@@ -190,7 +189,7 @@ def fold_warnings(
 
 def _stepped(flow: Diffeomorphism, y: Array, x: Array) -> Iterator[tuple[Flow, Array, Array]]:
     """The parts of ψ that take equal steps, with the samples (N, d) above and below each, in its coordinates."""
-    if isinstance(flow, Flow):
+    if isinstance(flow, Flow) and not flow.tolerance:
         yield flow, y, x
     elif isinstance(flow, Conjugated):
         yield from _stepped(flow.inner, flow.by.forward(y), flow.by.forward(x))

@@ -104,9 +104,8 @@ class Follower:
 
         def lifted() -> Lift:
             path, fraction, turns = trajectory.positions, trajectory.fraction, trajectory.orientations
-            keep = np.linspace(0, len(fraction) - 1, NUM_CONFIGURATIONS).round().astype(int)
-            wanted = None if turns is None else turns[None, keep]
-            return lift(self.robot, fraction[None, keep], path[None, keep], reference, orientations=wanted)
+            wanted = None if turns is None else turns[None]
+            return lift(self.robot, fraction[None], path[None], reference, orientations=wanted)
 
         return self._memo("added", (trajectory, reference.tobytes()), lifted, newest=NEWEST)
 

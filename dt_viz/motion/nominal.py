@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from dt_viz.avoidance.lift import NUM_CONFIGURATIONS
 from dt_viz.avoidance.passing import Posture
 from dt_viz.avoidance.start_status import StartStatus, start_warnings
 from dt_viz.flows.diffeomorphisms import Identity
@@ -20,8 +21,8 @@ from dt_viz.scenario.scenario import Start
 from dt_viz.scenario.tasks import Task
 from dt_viz.warning import MotionWarning
 
-NUM_SAMPLES, NUM_ADDED_SAMPLES = 200, 100
-"""Samples of each rollout before refinement: from the task's starts, and from added ones."""
+NUM_SAMPLES = 200
+"""Samples of each rollout from the task's starts before refinement; an added one has `NUM_CONFIGURATIONS`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +90,7 @@ class Learned:
     def trajectory(self, start: Start) -> NominalTrajectory:
         """The rollout from an added start; a label that it cannot have is that of the nearest demonstrated start."""
         label = start.label if start.label in self.labels else None
-        return self._trajectories(self.system.base.states(np.array([start.place]), label), NUM_ADDED_SAMPLES)[0]
+        return self._trajectories(self.system.base.states(np.array([start.place]), label), NUM_CONFIGURATIONS)[0]
 
     def nominal(self, added: Sequence[NominalTrajectory]) -> Nominal:
         """The rollouts from the task's starts and from added ones."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from dt_viz.flows.augmented_systems import Frozen
-from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain, Diffeomorphism, Flow, Identity, Placed
+from dt_viz.flows.diffeomorphisms import Chain, Diffeomorphism, Flow, Identity, Placed
 from dt_viz.flows.fields import Array
 from dt_viz.flows.rollouts import Rays
 from dt_viz.flows.systems import DiffeomorphicSystem
@@ -107,7 +107,7 @@ def generator_arrows(transform: Diffeomorphism, area: Slice) -> tuple[Array, Arr
 
 def displacements(transform: Diffeomorphism, points: Array) -> Array:
     """Return t·V (N, d) of the flows in a transform at points (N, d), added up: roughly what they displace."""
-    if isinstance(transform, Flow | AdaptiveFlow):
+    if isinstance(transform, Flow):
         return transform.duration * transform.field(points)
     if isinstance(transform, Placed):
         inner = transform.to_frame(points)[:, : transform.inner.dim]

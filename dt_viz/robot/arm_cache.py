@@ -68,16 +68,13 @@ def from_arrays(arrays: Mapping[str, np.ndarray], given: Mapping[str, Any]) -> R
     Raises:
         Exception: of almost any kind, if some are missing or do not fit.
     """
-    body = np.zeros(len(arrays["body_joint"]), BODY_POINT)
-    for name in BODY_POINT.names or ():
-        body[name] = arrays[f"body_{name}"]
     colours = [None if min(colour) < 0 else tuple(colour) for colour in arrays["visual_colours"].tolist()]
     values: dict[str, Any] = {name: constant(arrays[name]) for name in SMALL if name != "joint_names"}
     values["joint_names"] = tuple(arrays["joint_names"].tolist())
     robot = Robot(
         **values,
         **given,
-        body=BodyPoints(body),
+        body=BodyPoints.from_arrays(arrays, "body_"),
         num_fixed=int(arrays["num_fixed"]),
         touching=frozenset(frozenset(pair) for pair in arrays["touching"].tolist()),
         found=tuple((what, why) for what, why in arrays["found"].tolist()),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -30,6 +31,14 @@ class BodyPoints:
 
     spheres: NDArray[np.void]
     """(N,) all spheres for compiled loops, see `dt_viz.kernels.arm.BODY_POINT`."""
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray], prefix: str = "") -> BodyPoints:
+        """Make them of arrays that have the names of the fields of `spheres`, behind a prefix."""
+        spheres = np.zeros(len(arrays[f"{prefix}joint"]), BODY_POINT)
+        for name in BODY_POINT.names or ():
+            spheres[name] = arrays[f"{prefix}{name}"]
+        return cls(spheres)
 
     @cached_property
     def indices(self) -> Indices:

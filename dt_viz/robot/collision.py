@@ -253,7 +253,7 @@ class CollisionModel:
     def nearest_to_itself(self, q: ArrayLike) -> Nearest | None:
         """Find the smallest distance of two links on a path q (T, n), rad; None beyond `SELF_REACH`.
 
-        It is accurate to `link_distances.SELF_TOLERANCE`. Links that a joint connects or that may touch are left out.
+        It is accurate to `link_distances.SHAPE_TOLERANCE`. Links that a joint connects or that may touch are left out.
         """
         measure = BetweenLinks(self.links, self.touching)
         return self._search(measure, q, SELF_REACH) if len(measure.bodies) else None

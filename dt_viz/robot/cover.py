@@ -26,6 +26,7 @@ from dt_viz.files.triangles import grid_nodes, inside_of_grid, surface_samples
 from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.kernels.arm import BODY_POINT
 from dt_viz.kernels.bounding import step_to_the_farthest
+from dt_viz.obstacles.surfaces import golden_spiral
 from dt_viz.robot.meshes import LinkMesh, cells
 
 Progress = Callable[[float], object]
@@ -112,20 +113,14 @@ def protrusion(tree: NDArray[np.void], meshes: Sequence[LinkMesh], spacing: floa
         centres, radii = spheres["offset"], spheres["radius"]
         around = KDTree(centres)
         for centre, radius in zip(centres, radii, strict=True):
-            points = centre + radius * _evenly(int(4 * np.pi * (radius / (2 * spacing)) ** 2) + 8)
+            num = int(4 * np.pi * (radius / (2 * spacing)) ** 2) + 8
+            points = centre + radius * golden_spiral(num) * [1, 1, -1]
             others = around.query_ball_point(centre, radius + radii.max())
             apart, square = points - centre, centres[others] - centre  # products of small numbers keep their digits
             beyond = (square**2).sum(axis=1) - 2 * apart @ square.T - (radii[others] - 1e-9) ** 2
             found.append(surface.query(points[beyond.min(axis=1) >= -(radius**2)])[0])
     away = np.concatenate(found)
     return float(away.mean()), float(away.max())
-
-
-def _evenly(num: int) -> Array:
-    """Spread unit vectors (num, 3) along a spiral from pole to pole."""
-    height, angle = (np.arange(num) + 0.5) / num * 2 - 1, np.pi * (1 + np.sqrt(5)) * np.arange(num)
-    ring = np.sqrt(1 - height**2)
-    return np.stack([ring * np.cos(angle), ring * np.sin(angle), height], axis=1)
 
 
 def usual_radius(mesh: LinkMesh, reach: float, settings: CoverSettings) -> float:

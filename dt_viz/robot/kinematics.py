@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from dt_viz.flows.fields import Array
+from dt_viz.flows.rotations import quaternions
 from dt_viz.kernels.arm import JOINT, chains, places
 from dt_viz.robot.meshes import constant
 
@@ -137,7 +138,7 @@ class Kinematics:
     def hand_orientation(self, q: ArrayLike) -> Array:
         """Compute orientations (*B, 4) of the hand, whose z axis is along it, wxyz, base frame; q (*B, n), rad."""
         rotations = self.forward_kinematics(q)[0][..., -1, :, :] @ self.hand_rotation
-        return _quaternions(rotations.reshape(-1, 3, 3)).reshape(*rotations.shape[:-2], 4)
+        return quaternions(Rotation.from_matrix(rotations.reshape(-1, 3, 3))).reshape(*rotations.shape[:-2], 4)
 
     def jacobian(self, q: ArrayLike) -> Array:
         """Compute the linear Jacobian J (*B, 3, n) of the end effector in the base frame, ẋ = J q̇; q (*B, n), rad."""
@@ -151,7 +152,7 @@ class Kinematics:
         The positions of these frames do not depend on the angles q (*B, n), rad.
         """
         q = np.asarray(q, dtype=float)
-        w, x, y, z = _quaternions(self.joint_rotations).T
+        w, x, y, z = quaternions(Rotation.from_matrix(self.joint_rotations)).T
         c, s = np.cos(q / 2), np.sin(q / 2)
         # the fixed quaternion times (c, 0, 0, s), a turn about z
         return np.stack([w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s], axis=-1)
@@ -170,8 +171,3 @@ def cross(a: Array, b: Array) -> Array:
     ax, ay, az = a[..., 0, :], a[..., 1, :], a[..., 2, :]
     bx, by, bz = b[..., 0, :], b[..., 1, :], b[..., 2, :]
     return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-2)
-
-
-def _quaternions(rotations: Array) -> Array:
-    """Convert rotations (N, 3, 3) to unit quaternions (N, 4), wxyz."""
-    return np.roll(Rotation.from_matrix(rotations).as_quat(), 1, axis=-1)

@@ -27,10 +27,8 @@ from dt_viz.robot.meshes import LinkMesh, cells
 
 TOLERANCE = 1e-4
 """Largest excess of a reported smallest distance from a ball or the table, metres."""
-SELF_TOLERANCE = 1e-3
-"""Largest excess of a reported distance of links from each other, metres."""
 SHAPE_TOLERANCE = 1e-3
-"""Largest excess of a reported smallest distance from an obstacle that is no ball, metres."""
+"""Largest excess of a reported smallest distance from an obstacle that is no ball, or of links, metres."""
 SURFACE_SPACING = 2e-3
 """Spacing of points on a link's surface, vertices included, at which its depth in an obstacle is measured, metres."""
 INNER_SPACING = 4e-3
@@ -39,8 +37,6 @@ RESOLUTION = 3.5e-3
 """Largest error of a reported depth in an obstacle that is no ball, metres; 1.5 mm on a link's surface."""
 CERTAIN = 3e-3
 """Depth, metres, greater than the error of an obstacle's signed distance: a deeper point surely is inside."""
-FLAT = 1e-6
-"""Thickness up to which a link counts as flat, metres."""
 GROUP_SIZE = 0.02
 """Size of the cells into which these points are grouped, metres."""
 BALL_SIZE = 0.06
@@ -128,7 +124,7 @@ class Link:
         signs = np.array(np.meshgrid(*3 * [[-1.0, 1.0]])).reshape(3, -1).T
         self.corners = self.centre + signs * self.half_size
         self.hull = mesh.vertices
-        if np.linalg.matrix_rank(mesh.vertices - self.centre, tol=FLAT) == 3:  # qhull crashes on what is flat
+        if np.linalg.matrix_rank(mesh.vertices - self.centre, tol=1e-6) == 3:  # qhull crashes on what is flat
             self.surface.buildConvexHull(False, "Qt")
             self.hull = np.array(self.surface.convex.points())
 
@@ -297,7 +293,7 @@ def _bounding_volumes(vertices: Array, faces: Indices) -> coal.CollisionGeometry
 class BetweenLinks(Measure):
     """Distances of those pairs of links that can come near each other."""
 
-    tolerance = SELF_TOLERANCE
+    tolerance = SHAPE_TOLERANCE
     lowest = 0.0
 
     def __init__(self, links: Sequence[Link], touching: frozenset[frozenset[str]]) -> None:

@@ -13,7 +13,6 @@ import numpy as np
 from dt_viz.errors import naming
 from dt_viz.flows.fields import Array
 from dt_viz.folders import default_cache_folder
-from dt_viz.kernels.arm import BODY_POINT
 from dt_viz.memo import Memo
 from dt_viz.robot import arm_cache
 from dt_viz.robot.body_points import BodyPoints
@@ -171,15 +170,6 @@ def _load(name: str, progress: Progress | None, stored: bool) -> Robot:
     return replace(robot, visuals=tuple(visuals))
 
 
-def _shipped_body(file: Path) -> BodyPoints:
-    """Load the body points that ``python -m assets.make_body_points`` makes."""
-    with np.load(file, allow_pickle=False) as data:
-        spheres = np.zeros(len(data["joint"]), BODY_POINT)
-        for name in BODY_POINT.names or ():
-            spheres[name] = data[name]
-    return BodyPoints(spheres)
-
-
 def robot_from_urdf(
     path: str | Path,
     end_effector: EndEffector | None = None,
@@ -235,7 +225,8 @@ class _Given:
     locked: Sequence[str] | Mapping[str, float] | None = None
     levers: tuple[float, ...] | None = None
     body: Path | None = None
-    """File of body points; None makes them, and looks for links that always touch."""
+    """File of body points, as ``python -m assets.make_body_points`` makes it; None makes them, and looks for links that
+    always touch."""
     choice: ArmSearchSettings = field(default=ArmSearchSettings())
     cover: CoverSettings = field(default=CoverSettings())
 
@@ -309,7 +300,8 @@ class _Given:
                     solids, meshes, ranges, semantic, self.cover.protrusion, self.choice
                 )
             else:
-                body = _shipped_body(self.body)
+                with np.load(self.body, allow_pickle=False) as arrays:
+                    body = BodyPoints.from_arrays(arrays)
                 touching, touching_why = frozenset(), "neighbours alone"
             tell(0.85, "looking for a ready pose")
             solids.touching = touching

@@ -21,6 +21,7 @@ from scipy.interpolate import BSpline, CubicSpline
 
 from dt_viz.errors import FormatError
 from dt_viz.flows.fields import Array
+from dt_viz.metrics import arc_length
 from dt_viz.robot.joint_trajectory import JointTrajectory
 from dt_viz.robot.robot import Robot
 
@@ -100,7 +101,7 @@ def _timed(
     times: Array, q: Array, velocity: Array, acceleration: float, chosen: TrajectorySettings
 ) -> tuple[Moving, float]:
     """The motion through distinct samples (K, n) from rest to rest, and its duration, seconds."""
-    knots = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(q, axis=0), axis=1))])
+    knots = arc_length(q)
     curve = CubicSpline(knots, q)
     each = int(np.ceil(chosen.num_cells / (len(knots) - 1)))
     samples = np.arange(len(knots))

@@ -35,7 +35,7 @@ def within_velocity_limits(times: Array, q: Array, limits: Array) -> Array:
         (T,) seconds, from the same start: no interval is shorter than before, and in none is a joint's mean speed above
         its limit (up to rounding). A motion that respects the limits keeps its times, bit for bit.
     """
-    intervals, least = np.diff(times), _least_intervals(q, limits)
+    intervals, least = np.diff(times), (np.abs(np.diff(q, axis=0)) / limits).max(axis=1)  # at a joint's limit
     if (least <= intervals).all():
         return times
     slows = least > intervals + NEGLIGIBLE
@@ -59,8 +59,3 @@ def within_velocity_limits(times: Array, q: Array, limits: Array) -> Array:
     new = level + 2 / slope * (2 * at_highest - at_nodes[:-1] - at_nodes[1:])
     delays = np.maximum(np.maximum(new, least) - intervals, 0.0)
     return times + np.concatenate([[0.0], np.cumsum(delays)])
-
-
-def _least_intervals(q: Array, limits: Array) -> Array:
-    """Return the shortest duration (T − 1,) of each segment of q (T, n), at a joint's limit, seconds."""
-    return (np.abs(np.diff(q, axis=0)) / limits).max(axis=1)

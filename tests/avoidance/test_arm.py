@@ -8,7 +8,7 @@ from scenes import changed
 
 from dt_viz.avoidance.arm import WholeArm
 from dt_viz.avoidance.arm_settings import WholeArmSettings
-from dt_viz.avoidance.arm_solver import MAX_DURATION, ROUNDING, ArmSolution
+from dt_viz.avoidance.arm_solver import MARGIN_TOLERANCE, MAX_DURATION, ArmSolution
 from dt_viz.avoidance.lift import Lift
 from dt_viz.flows.diffeomorphisms import Identity
 from dt_viz.metrics import resample_by_arc_length, sharpest_turn
@@ -118,7 +118,7 @@ class TestAroundTheMiddle:
         assert solution.clearance == pytest.approx(case.arm.clearance(solution.p, case.middle).min())
         assert case.truth(solution, case.middle) > 0
         held = case.arm.robot.end_effector(solution.p)  # between the fingers, which may pass on both sides
-        assert case.middle.signed_distance(held).min() > case.scenario.arm_avoidance.margin - ROUNDING
+        assert case.middle.signed_distance(held).min() > case.scenario.arm_avoidance.margin - MARGIN_TOLERANCE
         assert (solution.p > case.robot.lower).all() and (solution.p < case.robot.upper).all()
         assert case.truth(case.lifted.tracked.q, case.middle) < -0.05  # so there was something to do
 
@@ -166,8 +166,8 @@ class TestMargin:
     @pytest.mark.parametrize("coarse", [True, False])
     def test_the_meshes_keep_what_is_asked_for_and_hardly_more(self, push, obstacle, coarse):
         margin, solution = push.scenario.arm_avoidance.margin, push.avoiding(obstacle, coarse=coarse)
-        assert margin - ROUNDING <= push.truth(solution, obstacle) < margin + PROTRUSION + ROUNDING
-        assert solution.clearance < margin + 2 * ROUNDING
+        assert margin - MARGIN_TOLERANCE <= push.truth(solution, obstacle) < margin + PROTRUSION + MARGIN_TOLERANCE
+        assert solution.clearance < margin + 2 * MARGIN_TOLERANCE
 
 
 def test_a_manual_duration_is_taken_as_it_is_and_motions_that_are_to_avoid_nothing_may_collide(case):
@@ -332,4 +332,4 @@ def test_where_the_first_way_out_is_long_the_one_with_the_least_detour_is_taken(
 def test_what_comes_too_near_without_touching_is_taken_farther_away_or_left(case, margin, clearance):
     solution = case.avoiding(case.beside(clearance), margin=margin, coarse=True)
     assert np.isfinite(solution.p).all()
-    assert solution.clearance > min(clearance, 0.002) - ROUNDING
+    assert solution.clearance > min(clearance, 0.002) - MARGIN_TOLERANCE

@@ -25,7 +25,7 @@ from laws.registry import (
 from oracles import central_differences
 
 from dt_viz.avoidance.arm_field import GradientField, WholeArmField
-from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Flow
+from dt_viz.flows.diffeomorphisms import Conjugated, Flow
 from dt_viz.obstacles.shapes import Box, Sphere
 from dt_viz.robot.models import HOME
 
@@ -165,7 +165,7 @@ class TestFlows:
 
     def chain(self, field, duration, tolerance=1e-9):
         """For a duration in units in which both kinds of generators are about as fast."""
-        return Conjugated(AdaptiveFlow(field, self.pace(field) * duration, tolerance), LIMITS)
+        return Conjugated(Flow.adaptive(field, self.pace(field) * duration, tolerance), LIMITS)
 
     def pace(self, field):
         return 1.0 if isinstance(field, WholeArmField) else 0.05

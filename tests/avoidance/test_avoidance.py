@@ -11,7 +11,7 @@ from scenes import avoiding
 from dt_viz.avoidance.clearing import clearing_duration
 from dt_viz.avoidance.hand import ACCEPTED_MARGIN, MAX_DURATION, SNAPSHOT, HandAvoidance
 from dt_viz.avoidance.transform import MotionBelow
-from dt_viz.flows.diffeomorphisms import AdaptiveFlow
+from dt_viz.flows.diffeomorphisms import Flow
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.warning import Kind, MotionWarning
 
@@ -34,7 +34,7 @@ def clearing(field, sphere, points, margin=MARGIN):
 
 
 def carried(field, points, duration):
-    return AdaptiveFlow(field, duration, 1e-9).inverse(points)
+    return Flow.adaptive(field, duration, 1e-9).inverse(points)
 
 
 def test_the_clearing_duration_needs_no_size_of_what_is_far_from_clear():

@@ -12,7 +12,7 @@ from dt_viz.avoidance.detour import NEARBY, Detour, carried_over
 from dt_viz.avoidance.hand import HandAvoidance
 from dt_viz.avoidance.sideways import Encounter, fixing_ends
 from dt_viz.avoidance.transform import MotionBelow
-from dt_viz.flows.diffeomorphisms import AdaptiveFlow
+from dt_viz.flows.diffeomorphisms import Flow
 from dt_viz.metrics import sharpest_turn
 from dt_viz.obstacles.shapes import Box, Cylinder, Sphere
 
@@ -224,7 +224,7 @@ def test_a_turn_that_would_lead_far_around_is_made_at_once():
 def test_a_side_is_held_where_what_is_stacked_on_it_moves_the_ends():
     motion = motion_past(0.01 * Y, end=RADIUS + 0.02)
     flow = passes_of(motion).flow(Z, 1e-9)
-    outer = AdaptiveFlow(ball().field("free-space", 6.0), 0.1, 1e-9)
+    outer = Flow.adaptive(ball().field("free-space", 6.0), 0.1, 1e-9)
     ends = np.concatenate([motion.starts, motion.goal[None]])
     moved = outer.forward(ends)
     assert np.linalg.norm(moved - ends, axis=1).min() > 1e-3

@@ -39,7 +39,7 @@ from dt_viz.evaluate.options import (
     report,
     whole_number,
 )
-from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain
+from dt_viz.flows.diffeomorphisms import Chain, Flow
 from dt_viz.flows.fields import Array
 from dt_viz.flows.integrators import DORMAND_PRINCE, carried
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
@@ -117,7 +117,7 @@ def rollouts(task: Task, learned: Learned, options: argparse.Namespace) -> tuple
     field = avoidance.avoided.field(avoidance.generator, avoidance.temperature)
 
     def with_obstacle(tolerance: float) -> DiffeomorphicSystem:
-        return replace(plain, transform=Chain([plain.transform, AdaptiveFlow(field, duration, tolerance)]))
+        return replace(plain, transform=Chain([plain.transform, Flow.adaptive(field, duration, tolerance)]))
 
     starts = task.starts
     while len(starts) < NUM_ROLLOUTS:  # also middles between neighbours

@@ -19,7 +19,7 @@ from dt_viz.avoidance.sideways import Sideways
 from dt_viz.avoidance.transform import Transform
 from dt_viz.baselines.eflow import Coupling, Normalisation
 from dt_viz.flows.augmented_systems import OnPlaces, PhaseCurve, PhasedAttractor, Shear, Translation
-from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain, Conjugated, Diffeomorphism, Flow, Identity, Placed
+from dt_viz.flows.diffeomorphisms import Chain, Conjugated, Diffeomorphism, Flow, Identity, Placed
 from dt_viz.flows.fields import GaussianGrid, GridRBF, PlacedField, Projected, Sum, VectorField
 from dt_viz.flows.integrators import EULER, IMPLICIT_EULER
 from dt_viz.flows.systems import Attractor
@@ -205,7 +205,7 @@ def coupling(seed: int = 0) -> Coupling:
 
 EXACT = Flow(bent(2), 0.8, 6, IMPLICIT_EULER, EULER)
 PLANE = Placed(Flow(bent(2), 0.8, 12), np.array([0.1, -0.2, 0.3]), tilted_axes(), 0.7)
-IN_SPACE = AdaptiveFlow(PlacedField(bent(3), np.array([0.2, 0.1, -0.1]), 0.5 * tilted_axes()), -0.6, 1e-9)
+IN_SPACE = Flow.adaptive(PlacedField(bent(3), np.array([0.2, 0.1, -0.1]), 0.5 * tilted_axes()), -0.6, 1e-9)
 MAPS: dict[str, Map] = {
     "flow rk4": Map(Flow(bent(2), 1.0, 16), 1e-6, 1e-5),
     "flow rk4 in space": Map(Flow(bent(3), 0.7, 16), 1e-6, 1e-5),
@@ -215,10 +215,10 @@ MAPS: dict[str, Map] = {
     "flow euler, implicit inverse": Map(Flow(bent(2), 0.8, 6, EULER, IMPLICIT_EULER), 1e-13),
     "flow implicit, euler inverse": Map(EXACT, 1e-13),
     "flow implicit in space": Map(Flow(bent(3), 0.8, 6, IMPLICIT_EULER, EULER), 1e-13),
-    "adaptive flow": Map(AdaptiveFlow(bent(2), 1.0, 1e-9), 1e-7, 1e-7),
+    "adaptive flow": Map(Flow.adaptive(bent(2), 1.0, 1e-9), 1e-7, 1e-7),
     "adaptive flow of a placed field": Map(IN_SPACE, 1e-7, 1e-7),
-    "chain": Map(Chain([Flow(bent(2, 1), 0.4), Flow(bent(2, 2), -0.5), AdaptiveFlow(bent(2, 3), 0.3)]), 1e-6),
-    "chain with a placed": Map(Chain([PLANE, Identity(3), AdaptiveFlow(bent(3, 4), 0.4)]), 1e-6),
+    "chain": Map(Chain([Flow(bent(2, 1), 0.4), Flow(bent(2, 2), -0.5), Flow.adaptive(bent(2, 3), 0.3)]), 1e-6),
+    "chain with a placed": Map(Chain([PLANE, Identity(3), Flow.adaptive(bent(3, 4), 0.4)]), 1e-6),
     "placed, plane in space": Map(PLANE, 1e-6, 1e-5),
     "placed, space in space": Map(Placed(Flow(bent(3), 0.5), np.ones(3), tilted_axes(), 2.0), 1e-6, 1e-5),
     "identity": Map(Identity(3), 1e-15, 1e-15),

@@ -9,7 +9,7 @@ from laws.registry import OBSTACLES, PLACE, SIMILAR, TILTED
 from oracles import central_differences
 
 from dt_viz.avoidance.clearing import clearing_duration
-from dt_viz.flows.diffeomorphisms import AdaptiveFlow
+from dt_viz.flows.diffeomorphisms import Flow
 from dt_viz.obstacles.covers import MAX_BALLS
 from dt_viz.obstacles.shapes import SHAPES, UPRIGHT, Box, CloudObstacle, MeshObstacle, Obstacle, rotation
 from dt_viz.obstacles.union import Union
@@ -156,7 +156,7 @@ def test_derivatives_of_the_field_are_derivatives(obstacle):
 @pytest.mark.parametrize("temperature", [1.0, pytest.param(3.0, marks=pytest.mark.slow), 12.0])
 def test_every_point_inside_leaves_along_the_reverse_flow(obstacle, temperature):
     field = obstacle.field("free-space", temperature)
-    ends = AdaptiveFlow(field, 4.0, 1e-5).inverse(within(obstacle, 200))
+    ends = Flow.adaptive(field, 4.0, 1e-5).inverse(within(obstacle, 200))
     assert obstacle.signed_distance(ends).min() > 0
 
 

@@ -98,9 +98,6 @@ class Missing(Diffeomorphism):
     def dim(self) -> int:
         return 3
 
-    def scaled(self, fraction: float) -> Diffeomorphism:
-        return self
-
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         return s + self.missed * AWAY * inverse, U
 
@@ -126,9 +123,6 @@ class Broken(Diffeomorphism):
     @property
     def dim(self) -> int:
         return 3
-
-    def scaled(self, fraction: float) -> Diffeomorphism:
-        return self
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         return (s if inverse else np.full_like(s, np.nan)), None if U is None else np.full_like(U, np.nan)

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scenes import avoiding, biases, changed, frame_at, says
 
+from dt_viz.avoidance.arm_solver import MARGIN_TOLERANCE
 from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.avoidance.hand import BESIDE, Avoidance
-from dt_viz.motion.diagnostics import MARGIN_TOLERANCE, MAX_GOAL_MISS, margin_warnings
+from dt_viz.motion.diagnostics import MAX_GOAL_MISS, margin_warnings
 from dt_viz.motion.stack import FINE
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.robot.body_points import BodyPoints

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from oracles import central_differences
 from scipy.special import expit
 
-from dt_viz.flows.diffeomorphisms import AdaptiveFlow
+from dt_viz.flows.diffeomorphisms import Flow
 from dt_viz.obstacles.learned_maps import unit_map
 from dt_viz.obstacles.occupancy import GENERATORS, AvoidanceField, fit_occupancy, sample_labels
 from dt_viz.obstacles.shapes import ORIGIN, Sphere
@@ -129,7 +129,7 @@ def test_occupancy_never_rises_along_the_reverse_flow(generator):
     s = in_ball(200, 1.5)
     logits = [BALL.logit(s)]
     for _ in range(20):
-        s = AdaptiveFlow(V, 0.1, 1e-7).inverse(s)
+        s = Flow.adaptive(V, 0.1, 1e-7).inverse(s)
         logits.append(BALL.logit(s))
     assert np.diff(logits, axis=0).max() <= 1e-9
     assert np.diff(logits, axis=0).min() < -0.1

@@ -15,7 +15,7 @@ from dt_viz.obstacles.surfaces import golden_spiral
 from dt_viz.robot.body_points import PROTRUSION, BodyPoints
 from dt_viz.robot.collision import SELF_REACH
 from dt_viz.robot.cover import bounding_sphere
-from dt_viz.robot.link_distances import SELF_TOLERANCE
+from dt_viz.robot.link_distances import SHAPE_TOLERANCE
 from dt_viz.robot.models import load_jaco
 from dt_viz.shipped import ASSETS
 
@@ -119,7 +119,7 @@ def test_links_keep_at_least_as_far_from_each_other_as_their_spheres_and_hardly_
     near = [(nearest.distance, asked) for nearest, asked in found if nearest is not None]
     apart = [true - asked for true, asked in near if true > 0]
     assert len(apart) > 20
-    assert -SELF_TOLERANCE < min(apart) <= max(apart) < 2 * PROTRUSION + SELF_TOLERANCE
+    assert -SHAPE_TOLERANCE < min(apart) <= max(apart) < 2 * PROTRUSION + SHAPE_TOLERANCE
 
 
 def test_distances_are_cut_off_at_their_bounds(body, robot):

@@ -18,7 +18,7 @@ from dt_viz.obstacles.shapes import Box, Cylinder, MeshObstacle, Sphere
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.collision import NOTHING, SELF_REACH, CollisionModel, CollisionReport, Nearest
 from dt_viz.robot.inverse_kinematics import inverse_kinematics, track
-from dt_viz.robot.link_distances import RESOLUTION, SELF_TOLERANCE, SHAPE_TOLERANCE, TOLERANCE
+from dt_viz.robot.link_distances import RESOLUTION, SHAPE_TOLERANCE, TOLERANCE
 from dt_viz.robot.meshes import LinkMesh
 from dt_viz.robot.models import load_jaco
 from dt_viz.warning import ARM, Kind, MotionWarning
@@ -252,7 +252,7 @@ class TestItself:
             alone = model.nearest_to_itself(one[None])
             if alone:
                 assert found
-                assert found.distance <= alone.distance + SELF_TOLERANCE
+                assert found.distance <= alone.distance + SHAPE_TOLERANCE
 
     def test_natural_postures_are_not_near_themselves(self, model, robot):
         for target in np.random.default_rng(0).uniform([-0.4, -0.65, 0.05], [0.4, -0.3, 0.75], (20, 3)):

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from dt_viz.avoidance.arm_solver import MARGIN_TOLERANCE
 from dt_viz.motion.certificates import MAX_ROUND_TRIP
-from dt_viz.motion.diagnostics import MARGIN_TOLERANCE
 from dt_viz.motion.stack import FINE
 from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.tasks import TASKS

@@ -1,6 +1,7 @@
 """Integrators chosen by hand: what they cost is measured and said, and nothing is said where they cost nothing."""
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from scenes import avoiding, biases, changed, random_scenario
 
 from dt_viz.avoidance.placement import bias_beside
 from dt_viz.avoidance.registry import AVOIDANCE
-from dt_viz.flows.diffeomorphisms import AUTO, AdaptiveFlow, Chain, Conjugated, Flow, Integration
+from dt_viz.flows.diffeomorphisms import AUTO, Chain, Conjugated, Flow, Integration
 from dt_viz.flows.fields import GaussianGrid, GridRBF
 from dt_viz.flows.integrators import EULER, RK4
 from dt_viz.motion.diagnostics import fold_warnings, integration_warnings
@@ -26,7 +27,7 @@ Y = np.random.default_rng(1).uniform(-0.8, 0.8, (200, 3))
 
 
 def test_auto_leaves_a_flow_as_it_is_and_others_take_their_steps():
-    for flow in (Flow(field(), 0.7, 13), AdaptiveFlow(field(), 0.7)):
+    for flow in (Flow(field(), 0.7, 13), Flow.adaptive(field(), 0.7)):
         assert AUTO.of(flow) is flow
         assert Integration("euler", 3).of(flow) == Flow(flow.field, 0.7, 3, EULER)
         assert Integration("rk4", 5).of(flow) == Flow(flow.field, 0.7, 5, RK4)
@@ -65,10 +66,12 @@ def test_a_fold_of_what_is_drawn_is_found_where_there_is_none_on_the_way_back():
     conjugated = Conjugated(flow, by)
     assert fold_warnings("It", conjugated, coarse, by.inverse(y[missed]), by.inverse(x[missed]))
     assert fold_warnings("It", conjugated, coarse, by.inverse(y[fine]), by.inverse(x[fine])) == ()
-    inner, outer = AdaptiveFlow(field(0.3), 1.0), AdaptiveFlow(field(0.25), -1.0)  # and in a chain with others
+    inner, outer = Flow.adaptive(field(0.3), 1.0), Flow.adaptive(field(0.25), -1.0)  # and in a chain with others
     chain, ends = Chain([inner, flow, outer]), (outer.inverse(y), inner.forward(x))
     assert fold_warnings("It", chain, coarse, ends[0][missed], ends[1][missed])
     assert fold_warnings("It", chain, coarse, ends[0][fine], ends[1][fine]) == ()
+    unasked = Mock(dim=3, side_effect=AssertionError)  # the field of a flow without equal steps
+    assert fold_warnings("It", Flow.adaptive(unasked, 1.0), coarse, y, x) == ()
 
 
 def certified(engine, scenario):
