@@ -168,8 +168,10 @@ class ProtocolClient:
         (await asyncio.to_thread(urlopen, address)).close()
 
     async def set(self, label: str, value: bool | float | str) -> None:
-        """Set the value of a control."""
-        await self.send("GuiUpdateMessage", uuid=self.find(label), updates={"value": value})
+        """Set the value of a control; the page shows it at once, since the server does not send it back."""
+        uuid = self.find(label)
+        self.controls[uuid]["value"] = value
+        await self.send("GuiUpdateMessage", uuid=uuid, updates={"value": value})
 
     async def send_file(
         self, label: str, name: str, content: bytes, *, announced: int | None = None, transfer: str = ""

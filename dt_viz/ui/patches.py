@@ -90,12 +90,17 @@ def open_server(options: Options, listening: socket.socket, **arguments: Any) ->
         GateError: viser does not start its server as expected.
     """
     module: Any = websockets.asyncio.server
-    original, used = module.serve, []
+    original, used, whole = module.serve, [], threading.Event()
 
     def serve(handler: Any, *_where: Any, **given: Any) -> Any:  # noqa: ANN401
+        async def once_whole(connection: Any) -> None:  # noqa: ANN401 - of a socket that others have listened on before
+            if not whole.is_set():
+                await asyncio.to_thread(whole.wait)
+            await handler(connection)
+
         used.append(True)
-        handler, given = options(handler, given)
-        return original(handler, sock=listening, **given)
+        taken, given = options(once_whole, given)
+        return original(taken, sock=listening, **given)
 
     module.serve = serve
     try:
@@ -103,6 +108,7 @@ def open_server(options: Options, listening: socket.socket, **arguments: Any) ->
             server = viser.ViserServer(**arguments)
     finally:
         module.serve = original
+        whole.set()
     connections = getattr(getattr(server, "_websock_server", None), "_live_connections", None)
     if not used or not isinstance(connections, dict):
         server.stop()

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 import pytest
 import viser  # noqa: TID251 - whose version the page has
-import websockets
+import websockets.sync.client
 from pages import wait_until
 from viser.infra._async_message_buffer import AsyncMessageBuffer  # noqa: TID251
 from websockets.asyncio.client import connect
@@ -610,6 +610,28 @@ def test_a_viser_that_serves_in_another_way_is_refused(monkeypatch):
     ):
         a_gate().open(listening, "")
     assert stopped
+
+
+def test_who_comes_while_the_server_is_made_waits_for_it(monkeypatch, caplog):
+    """As at a socket on which other processes have listened before."""
+    made, clients = viser.SceneApi, []
+
+    def slow(*arguments, **options):
+        if not clients:
+            protocol = Subprotocol(f"viser-v{viser.__version__}")
+            clients.append(websockets.sync.client.connect(url, subprotocols=[protocol], proxy=None))
+        return made(*arguments, **options)
+
+    monkeypatch.setattr("viser._viser.SceneApi", slow)
+    with closing(listen("127.0.0.1", 0)) as listening:
+        url = f"ws://127.0.0.1:{listening.getsockname()[1]}"
+        server = a_gate().open(listening, "")
+        try:
+            wait_until(lambda: len(server.get_clients()) == 1, PATIENCE)
+            assert not [record for record in caplog.records if record.levelno >= logging.ERROR]
+        finally:
+            clients[0].close()
+            server.stop()
 
 
 @asynchronous
