@@ -132,7 +132,8 @@ def _chosen(name: str) -> Saved:
         return Saved(steps[name](TASKS[TASK]()))
     if name not in TASKS:
         known = *(each.name for each in scenes), *TASKS, *steps
-        raise FormatError("SCENE", repr(name), f"{', '.join(known)}, or the .json of a saved scenario")
+        accepted = f"{', '.join(known)}, a figure such as fig-4, or the .json of a saved scenario"
+        raise FormatError("SCENE", repr(name), accepted)
     return Saved(initial(TASKS[name]()))
 
 

@@ -182,16 +182,16 @@ class MPNetPlanner:
     def __call__(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
         """Plan around an obstacle as far as that succeeds; see `Planner`."""
         surroundings = PlanningScene(self.problem.robot, obstacle)
-        queries, ways, warnings = [], [], []
-        for number, start in enumerate(starts):
+        queries, ways, colliding = [], [], 0
+        for start in starts:
             query = Query.of(self.problem, start)
             search = Search(self.model, surroundings, np.random.default_rng(ARCHITECTURE.seed), cancelled)
             way = search.way(query, self.replan)
-            if not search.is_free(way):
-                warnings.append(f"the motion from start {number + 1} collides: no free way was found")
+            colliding += not search.is_free(way)
             queries.append(query)
             ways.append(np.stack(way))
-        return planned(self.problem, queries, ways, tuple(warnings))
+        warning = f"motions from {colliding} of {len(starts)} starts collide: no free way was found"
+        return planned(self.problem, queries, ways, (warning,) * (colliding > 0))
 
 
 def fit(problem: Problem, replan: Replan | None = None, folder: Path = FOLDER) -> Planner:

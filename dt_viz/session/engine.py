@@ -138,14 +138,18 @@ class Engine:
             ImitationError: nothing can be learned from them.
             UnwantedError: it is cancelled.
         """
+        steps = list[str]()
 
         def learn(fraction: float, message: str) -> None:
             _cores.give_way()
+            steps.append(message)
             if progress is not None:
                 progress(fraction, message)
 
         self.nominal(scenario, learn)
         learned = self._shown(scenario, learn)
+        if steps:
+            learn(1.0, "computing the motion; what is new to this processor is compiled, once")
         rank = Rank.BEGINNING if scenario.passing is ANEW else Rank.HAND
         with _cores.slot(rank):
             scenario = newest(scenario)

@@ -118,8 +118,6 @@ class Screen:
         self.progress = Progress(wanted, restored=restored)
         self._pace = self.progress.pace
         """Of the newest frame."""
-        self._learned = -math.inf
-        """Time of the newest news of learning, of `time.perf_counter`."""
         self._live_frames: deque[float] = deque(maxlen=120)
         """Times of the newest frames of stage LIVE, of `time.perf_counter`."""
 
@@ -133,8 +131,6 @@ class Screen:
     def tell(self, **changes: Any) -> None:  # noqa: ANN401 - the fields of Progress
         """Change the progress and show it."""
         with self._telling:
-            if changes.get("learning") is not None:
-                self._learned = time.perf_counter()
             self.progress = replace(self.progress, **changes)
             self._display.tell(self.progress)
 
@@ -153,11 +149,11 @@ class Screen:
     def draw(self, frame: Frame, edited: float, num_skipped: int, num_edits: int) -> None:
         """Show a frame whose scenario was asked for at a time, of `time.perf_counter`; learning is no rebuild."""
         now = time.perf_counter()
-        latency = now - max(edited, self._learned)
         if frame.stage is Stage.LIVE:
             self._live_frames.append(now)
         rate = sum(now - t <= 1.0 for t in self._live_frames)
-        latency = latency if frame.stage <= Stage.LIVE else self._pace.latency
+        is_rebuilt = frame.stage <= Stage.LIVE and self.progress.learning is None
+        latency = now - edited if is_rebuilt else self._pace.latency
         self._pace = Pace(latency, rate, num_skipped, num_edits)
         self._display.draw(frame, self._pace)
         if frame.stage is not Stage.ROLLOUTS:  # the next stage is a few milliseconds away

@@ -145,7 +145,7 @@ class TestRRT:
     def test_what_there_is_no_time_for_stays_in_collision_and_says_so(self, problem, in_the_way):
         plan = mpnet_rrt.fit(problem, seconds=0.0)(in_the_way, problem.task.starts[:1])
         assert load_jaco().collision.nearest_to_obstacle(joints_of(plan)[0], in_the_way).distance < 0
-        assert "start 1 collides" in plan.warnings[0]
+        assert "from 1 of 1 starts collide" in plan.warnings[0]
 
     @needs_ompl
     def test_an_exception_within_ompl_ends_it(self, problem, in_the_way):

@@ -452,11 +452,13 @@ def test_what_is_shown_is_stale_while_another_task_is_expected_read_or_learned(o
     opened.engine.gate.set()
     opened.settle()
     assert not opened.page.progress.stale
+    before = opened.page.paces[-1].latency
     begin_learning(opened, "push_box")
     assert opened.page.progress.stale
     opened.engine.unlearned = set()
     opened.settle()
     assert opened.page.progress.complete and opened.page.progress.learning is None
+    assert opened.page.paces[-1].latency == before  # to learn is not to rebuild
 
 
 UNDRAWABLE = View(generator=True, generator_layer=-9, health_plots=True)

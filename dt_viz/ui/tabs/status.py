@@ -103,7 +103,7 @@ def verdict(progress: Progress) -> Verdict:
         figures += ("stable" if known.lyapunov_falls else "not stable",)
     if progress.wanted == progress.restored:
         figures += ("as saved",)
-    else:
+    elif latency > 0:
         figures += (f"{1e3 * latency:.0f} ms" if latency < 1 else f"{latency:.1f} s",)
     head, severity, reason = _judged(frame, concerns(frame, view))
     if not progress.complete:
