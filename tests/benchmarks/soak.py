@@ -7,7 +7,7 @@ way. When his connection is lost he comes again, as a page does, with what his b
 gives way and the place of the obstacle are compared with all that he had, back from the last one:
 
 back s
-    from the loss to the first picture of the page that has opened again.
+    from the loss to the first picture with something that he has had, of the page that has opened again.
 lost s
     how old what he found again was when the connection was lost: time from where it was changed to then.
 edits lost
@@ -66,6 +66,8 @@ class SoakSettings:
     """Time after which the page has what was chosen."""
     recent: float = 5.0
     """Time after a kill in which a lost connection is its consequence."""
+    told: float = 10.0
+    """Time in which a browser that is slow tells what it keeps, while its page shows how it begins."""
     patience: float = 60.0
     """Longest time to wait for a page."""
     first_kill: float = 10.0
@@ -111,7 +113,9 @@ class Soaked:
                         self.reasons.append("no picture in time")
                         return
                     if lost:
-                        self.back.append(time.monotonic() - lost)
+                        opened = time.monotonic()
+                        known = await client.wait_for(lambda client=client: self.knows(state_of(client)), SETTINGS.told)
+                        self.back.append((time.monotonic() if known else opened) - lost)
                         self.compare(state_of(client), lost)
                         lost = 0.0
                     self.had = [(time.monotonic(), self.num_edits, state_of(client))]
@@ -152,6 +156,10 @@ class Soaked:
 
     def _has(self, state: State | None) -> None:
         self.had.append((time.monotonic(), self.num_edits, state))
+
+    def knows(self, found: State) -> bool:
+        """Return whether he has had what is found."""
+        return any(state is not None and is_same(state, found) for _, _, state in self.had)
 
     def compare(self, found: State, lost: float) -> None:
         """Count what is not found again of what there was when the connection was lost."""
