@@ -129,7 +129,7 @@ class Visitor(Display):
         with client.atomic():
             self.pictures = ScenePictures(client.scene, robot, lambda: self.session)
             self.robot = RobotScene(client, robot, Playback(engine.arm, self._pose))
-        self._exchanging = threading.RLock()  # the arm is moved, and shown or hidden, by other threads
+        self._exchanging = threading.RLock()  # the arm is moved, drawn, and shown or hidden, by different threads
         self._studio = Studio(self.pictures, lambda: self.robot, self._changing)
         titled = {"": robot.title} if arms is None else arms.titles
         pen = Pen(self.pictures, lambda: self.robot, lambda: self.session, self._face)
@@ -212,7 +212,8 @@ class Visitor(Display):
             self._keeper.changed()
         with self.client.atomic():
             self.pictures.draw(frame)
-            self.robot.draw(frame, self.pictures.look)
+            with self._exchanging:
+                self.robot.draw(frame, self.pictures.look)
         if frame.stage is not Stage.ROLLOUTS:
             self._panel.report(frame)
         self.client.flush()

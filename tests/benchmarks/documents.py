@@ -79,13 +79,6 @@ def _imitation(command: str, rows: Sequence[Row]) -> Iterator[Cell]:
             yield measure, "nearest start, shifted", f"{row[f'nearest{suffix}_mm']:.2f}"
 
 
-def _arms(_command: str, rows: Sequence[Row]) -> Iterator[Cell]:
-    columns = ("joints", "cleared", "others with a way", "least mm", "loop at goal", "loop least mm", "frame × JACO")
-    for row in rows:
-        for column in (*columns, "cover mm"):
-            yield row["arm"], column, as_text(row[column])
-
-
 def _around(command: str, rows: Sequence[Row]) -> Iterator[Cell]:
     found = {row["figure"]: row["value"].partition(" (")[0] for row in rows if "figure" in row}
     figures = ("blocked between free ends", "from some of the starts only", "collisions", "at least 9 mm kept")
@@ -115,13 +108,15 @@ def _of_load(results: Sequence[Result]) -> Iterator[Cell]:
 
 
 def _of_imitation(results: Sequence[Result]) -> Iterator[Cell]:
+    figures: dict[str, float] = {}
     for command, rows in results:
         for row in rows:
             if row["name"] == "mean" and "learned_mm" in row:
-                measured = "Fréchet distance of held-out demonstrations, 17 LASA files; of the others' shifted mean"
-                state = _option(command, "state", "plain")
-                figure = f"{row['learned_mm']:.2f}; {row['mean_mm']:.2f} mm"
-                yield from _summed_up(f"{measured}: {state}", figure, command)
+                figures[_option(command, "state", "plain")] = row["learned_mm"]
+                figures["the others' shifted mean"] = row["mean_mm"]
+    text = ", ".join(f"{name} {figure:.2f}" for name, figure in figures.items())
+    measured = "Fréchet distance of held-out demonstrations, 17 LASA files, states and what needs no learning"
+    yield from _summed_up(measured, f"{text} mm", results[0][0])
 
 
 def _of_table1(results: Sequence[Result]) -> Iterator[Cell]:
@@ -175,11 +170,11 @@ TABLES_OF: Mapping[str, Mapping[str, Table]] = {
     "reactive": {"reactive": _each(_reactive)},
     "imitation": {"imitation": _each(_imitation)},
     "around": {"around": _each(_around)},
-    "arms": {"arms": _each(_arms)},
     "developers": {
-        "latency": _figure(lambda rows: "edit → frame {median ms:.1f} / {p95 ms:.1f} ms".format(**rows[1])),
+        "latency": _figure(
+            lambda rows: "edit → frame {median ms:.1f} / {p95 ms:.1f} ms, {in units:.1f} units".format(**rows[1])
+        ),
         "scenes": _figure(_click),
-        "drag": _figure(lambda rows: "{frames in which a rollout jumps} of {frames} frames jump".format(**rows[-1])),
         "learning": _figure(_shape_errors),
         "fairness": _figure(_gaps),
     },
@@ -189,7 +184,6 @@ CORNERS = {
     "summary": "measured",
     "imitation": "mm",
     "developers": "command",
-    "arms": "arm",
     "table1": "method",
     "load": "visitors",
 }

@@ -136,11 +136,11 @@ class Soaked:
             label = generator.choice(("Task", "Avoid"))
             self._has(None)
             await client.set(label, generator.choice(client.controls[client.find(label)]["options"]))
-            await asyncio.sleep(SETTINGS.settled)
+            await _rest(client, SETTINGS.settled)
             self._has(state_of(client))
         else:
             await self._drag(client, generator)
-        await asyncio.sleep(generator.uniform(*SETTINGS.rest))
+        await _rest(client, generator.uniform(*SETTINGS.rest))
 
     async def _drag(self, client: ProtocolClient, generator: random.Random) -> None:
         task, avoid, place = state_of(client)
@@ -151,7 +151,7 @@ class Soaked:
             place = tuple(x + generator.gauss(0.0, SETTINGS.step) for x in place)
             self._has((task, avoid, place))
             await client.move(place)
-            await asyncio.sleep(SETTINGS.interval)
+            await _rest(client, SETTINGS.interval)
         await client.release()
 
     def _has(self, state: State | None) -> None:
@@ -175,6 +175,11 @@ class Soaked:
                 self.num_lost += not (edit >= last or (edit == last - 1 and whole))
                 return
         self.num_lost += 1
+
+
+async def _rest(client: ProtocolClient, seconds: float) -> None:
+    """Wait so long. Raises LostError as soon as the connection is lost, not with what is sent next."""
+    await client.wait_for(lambda: False, seconds)
 
 
 def state_of(client: ProtocolClient) -> State:

@@ -305,10 +305,18 @@ def test_the_whole_arm_is_let_avoid_where_that_mends():
 
 def test_what_nothing_else_mends_is_mended_by_undo_where_there_is_a_step():
     for told in (frame(blocked=(ODD,)), frame(certificates=Certificates(0.01).warning(ODD))):
-        assert remedy(told, Progress(HAND)) is None
         assert remedy(told, Progress(HAND, steps=(True, False))) is UNDO
         assert remedy(told, Progress(HAND, steps=(True, False), beside=(True, False))) is None  # it undoes a take
     assert remedy(frame(), Progress(HAND, steps=(True, True))) is None
+
+
+def test_obstacles_without_a_way_around_are_taken_away_where_there_is_no_step_back():
+    found = remedy(frame(blocked=(ODD,)), Progress(HAND))
+    assert found is not None and found.label == "Take the obstacles away"
+    assert replace(HAND, **found.changes or {}) == changed(HAND, obstacles=())
+    without = changed(HAND, obstacles=())
+    assert remedy(frame(without, blocked=(ODD,)), Progress(without)) is None
+    assert remedy(frame(certificates=Certificates(0.01).warning(ODD)), Progress(HAND)) is None  # there is a way
 
 
 IN_STROKE = Sphere(TASKS["draw_s"]().obstacle_position, 0.12)

@@ -2,11 +2,12 @@
 
 import math
 import re
+import threading
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from pages import all_of, frame_of, wait_until
+from pages import all_of, frame_of, ignored, wait_until
 
 from dt_viz.motion.following import ArmMotion
 from dt_viz.scenario.scenario import View
@@ -229,3 +230,25 @@ def test_a_place_is_marked_where_the_path_is_nearest():
     path = np.array([[0.0, 0, 0], [1, 0, 0], [1, 3, 0]])
     assert [place_along(path, np.array(place)) for place in ((-1, 0, 0), (1.2, 0.1, 0), (1, 9, 9))] == [0.0, 0.25, 1.0]
     assert "path" not in cursor_html(time=0.5, path=None)
+
+
+def test_a_frame_of_another_task_waits_while_the_arm_is_moved(page, monkeypatch):
+    """What the hand carries would be taken from the scene while it is moved."""
+    visitor, frame, order, drawing = page.visitor, frame_of(page.session.scenario, task=page.session.task), [], []
+    monkeypatch.setattr(visitor.pictures, "draw", lambda _frame: order.append("scene"))
+    monkeypatch.setattr(visitor.robot, "draw", lambda *_what: order.append("arm"))
+    monkeypatch.setattr(visitor._panel, "report", ignored)
+    monkeypatch.setattr(visitor, "shown", frame)
+
+    def pose(_now, _tubes):
+        if not drawing:
+            drawing.append(threading.Thread(target=visitor._draw, args=(frame,)))
+            drawing[0].start()
+            wait_until(lambda: order)
+            drawing[0].join(0.1)
+            order.append("posed")
+
+    monkeypatch.setattr(visitor.robot, "pose", pose)
+    visitor._pose()
+    drawing[0].join()
+    assert order == ["scene", "posed", "arm"]

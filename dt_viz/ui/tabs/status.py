@@ -181,8 +181,12 @@ def remedy(frame: Frame, progress: Progress) -> Remedy | None:
         return Remedy("Complete the warp", {"warp": 1.0})
     found = concerns(frame, wanted.view)
     mends = None if frame.blocked or not found else _against(found[0].kind.mend, found[0].source, wanted)
-    undoes = progress.steps[0] and progress.beside is None
-    return UNDO if mends is None and undoes and (frame.blocked or found) else mends
+    if mends is not None or progress.beside is not None or not (frame.blocked or found):
+        return mends
+    if progress.steps[0]:
+        return UNDO
+    blocks = frame.blocked and wanted.avoidance.obstacles  # after a reload there is no step back
+    return Remedy("Take the obstacles away", {"stack": with_avoidance(wanted, obstacles=())}) if blocks else None
 
 
 def _against(mend: Mend | None, source: str, scenario: Scenario) -> Remedy | None:
