@@ -50,7 +50,7 @@ def _load(command: str, rows: Sequence[Row]) -> Iterator[Cell]:
 
 def _table1(_command: str, rows: Sequence[Row]) -> Iterator[Cell]:
     for row in rows:
-        columns = ("frechet", "arm_depth", "depth", "turn °", "reached %", "seconds s")
+        columns = ("frechet", "arm_depth", "hand_depth", "turn °", "reached %", "seconds s")
         yield row["method"], row["task"], "; ".join(row[column] for column in columns)
 
 
@@ -71,7 +71,8 @@ def _imitation(command: str, rows: Sequence[Row]) -> Iterator[Cell]:
         if row["name"] != "mean":
             continue
         if "learned_mm" not in row:
-            yield "in-sample, of these the worst", state, f"{row['frechet_mean_mm']:.2f}, {row['frechet_max_mm']:.2f}"
+            figure = "{frechet_mean_mm:.2f}, {frechet_max_mm:.2f}".format(**row)
+            yield "in-sample, and the worst of each file", state, figure
             continue
         for measure, suffix in {"held out": "", "held out, RMS at equal times": "_rms"}.items():
             yield measure, state, f"{row[f'learned{suffix}_mm']:.2f}"
@@ -121,13 +122,23 @@ def _of_imitation(results: Sequence[Result]) -> Iterator[Cell]:
 
 def _of_table1(results: Sequence[Result]) -> Iterator[Cell]:
     command, rows = results[0]
-    for method in ("Ours", "EFlow (repulsive), 20 Hz"):
+    for method in ("Ours", "EFlow (repulsive)"):
         cells = [(row["frechet"], row["arm_depth"]) for row in rows if row["method"] == method]
         distances, depths = (
             ", ".join(cell.partition(" ")[0] for cell in column) for column in zip(*cells, strict=True)
         )
         measured = f"Fréchet distance around a 15 cm sphere, push, lift, draw S; depth of the arm in it: {method}"
         yield from _summed_up(measured, f"{distances}; {depths} mm", command)
+
+
+def _of_latency(results: Sequence[Result]) -> Iterator[Cell]:
+    figures: dict[str, list[str]] = {}
+    for command, rows in results:
+        text = "{median ms:.0f} / {p95 ms:.0f} ms, {in units:.1f} units".format(**rows[1])
+        others = re.sub(r"--task \S+", "--task …", _short(command))
+        figures.setdefault(f"`{others}`", []).append(f"{_option(command, 'task')} {text}")
+    for row, texts in figures.items():
+        yield row, "figure", "; ".join(texts)
 
 
 def _of_reactive(results: Sequence[Result]) -> Iterator[Cell]:
@@ -147,7 +158,7 @@ def _of_reactive(results: Sequence[Result]) -> Iterator[Cell]:
 
 def _summed_up(measured: str, figure: str, command: str) -> Iterator[Cell]:
     yield measured, "figure", figure
-    yield measured, "command: `dt-viz evaluate …`", f"`{_short(command)}`"
+    yield measured, "command: `dt-viz evaluate …`", f"`{_short(command)} --out F`"
 
 
 Table = Callable[[Sequence[Result]], Iterator[Cell]]
@@ -171,9 +182,7 @@ TABLES_OF: Mapping[str, Mapping[str, Table]] = {
     "imitation": {"imitation": _each(_imitation)},
     "around": {"around": _each(_around)},
     "developers": {
-        "latency": _figure(
-            lambda rows: "edit → frame {median ms:.1f} / {p95 ms:.1f} ms, {in units:.1f} units".format(**rows[1])
-        ),
+        "latency": _of_latency,
         "scenes": _figure(_click),
         "learning": _figure(_shape_errors),
         "fairness": _figure(_gaps),
@@ -198,7 +207,7 @@ def _option(command: str, name: str, default: str = "") -> str:
 
 def _short(command: str) -> str:
     """The command without its program, and where and on how many processors it computes."""
-    return re.sub(r"^python -m \S+ | --jobs \d+| --out \S+$", "", command)
+    return re.sub(r"^python -m \S+ | --jobs \d+| --out \S+$", "", command).replace("LASA", "LASA/*.mat")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -220,9 +229,9 @@ def filled(document: str) -> str:
     """Return a document with the tables of the rows that are kept."""
 
     def table(match: re.Match[str]) -> str:
-        return f"{match[1]}\n\n{made(match[2])}\n"
+        return f"{match[1]}\n\n{made(match[2])}"
 
-    return re.sub(r"(<!-- measured: (\w+) -->)\n\n(?:\|.*\n)*", table, document)
+    return re.sub(r"(<!-- measured: (\w+) -->)(?:\n\n\|.*(?:\n\|.*)*)?", table, document)
 
 
 def made(name: str) -> str:
