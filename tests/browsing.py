@@ -113,7 +113,7 @@ def open_page(browser, server, size, ratio=1):
     (visitor,) = set(server.visitors) - known
     visitor.session.edit("test", view=LIGHT)
     assert visitor.session.wait_idle(PATIENCE)
-    page.get_by_text("· stable ·").wait_for()
+    page.get_by_text("· stable").wait_for()
     until_drawn(visitor)
     close_notices(page)
     return page, visitor

@@ -118,7 +118,7 @@ def see_the_motion(browser, address, patience):
         page.set_default_timeout(1000 * patience)
         page.add_init_script(UNHURRIED)
         page.goto(address)
-        page.get_by_text("· stable ·").wait_for()
+        page.get_by_text("· stable").wait_for()
         page.evaluate("isLookedAt = true")
         while num_rollout_pixels(page.screenshot()) < 300:
             if time.monotonic() > deadline:

@@ -52,7 +52,7 @@ def reload(page, server):
     page.reload()
     wait_until(lambda: set(server.visitors) - before, "the page of a visitor")
     (visitor,) = set(server.visitors) - before
-    page.get_by_text("· stable ·").wait_for()
+    page.get_by_text("· stable").wait_for()
     assert visitor.session.wait_idle(PATIENCE)
     return visitor
 

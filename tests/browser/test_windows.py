@@ -57,7 +57,7 @@ def visit(opened, initial, request):
     width, height = request.param
     page.set_viewport_size({"width": width, "height": height})
     begin(visitor, replace(initial("draw_s"), view=LIGHT))
-    page.get_by_text("· stable ·").wait_for()
+    page.get_by_text("· stable").wait_for()
     wait_until(lambda: has_shape(visitor.client.camera, width / height), "the page to have the window's shape")
     until_drawn(visitor)
     close_notices(page)
@@ -75,7 +75,7 @@ def boxes(page):
     """Boxes of the first controls, from the top down to what changes as one works."""
     controls = {name: page.get_by_label(name, exact=True) for name in ("Task", "Scene", "Avoid", "Imitate")}
     controls |= {f"name of {name}": page.locator("label").get_by_text(name, exact=True) for name in controls}
-    controls["status"] = page.get_by_text("· stable ·")
+    controls["status"] = page.get_by_text("· stable")
     return {name: control.first.evaluate(BOX) for name, control in controls.items()}
 
 
