@@ -93,8 +93,8 @@ def open_server(options: Options, listening: socket.socket, **arguments: Any) ->
     original, used, whole = module.serve, [], threading.Event()
 
     def serve(handler: Any, *_where: Any, **given: Any) -> Any:  # noqa: ANN401
-        async def once_whole(connection: Any) -> None:  # noqa: ANN401 - of a socket that others have listened on before
-            if not whole.is_set():
+        async def once_whole(connection: Any) -> None:  # noqa: ANN401
+            if not whole.is_set():  # viser serves before it is complete, and the socket may have connections waiting
                 await asyncio.to_thread(whole.wait)
             await handler(connection)
 

@@ -29,22 +29,24 @@ Result = tuple[str, Sequence[Row]]
 """A command with its options, and the rows that it has printed."""
 Cell = tuple[str, str, str]
 """Row and column of a document's table, and the text of that cell."""
+LOAD = (
+    "first picture s",
+    "pictures/s of each",
+    "gap ms, median / 95 % / worst",
+    "edit → picture ms",
+    "edits answered in 0.5 s %",
+    "ping ms",
+    "cores",
+    "MB",
+)
+"""Columns of `load` that a document shows."""
 
 
 def _load(command: str, rows: Sequence[Row]) -> Iterator[Cell]:
     kinds = {"--lecture": ", lecture", "--rest": " who look on", "--present": " who watch one more"}
     kind = next((kind for option, kind in kinds.items() if option in command), "")
     for row in rows:
-        for column in (
-            "first picture s",
-            "pictures/s of each",
-            "gap ms, median / 95 % / worst",
-            "edit → picture ms",
-            "edits answered in 0.5 s %",
-            "ping ms",
-            "cores",
-            "MB",
-        ):
+        for column in LOAD:
             yield row["visitors"] + kind, column, as_text(row[column])
 
 
@@ -152,7 +154,9 @@ def _of_reactive(results: Sequence[Result]) -> Iterator[Cell]:
         "{} of {} at {}".format(*map(sum, zip(*found, strict=True)), crossing) for crossing, found in passages.items()
     )
     yield from _summed_up(
-        "a sphere crosses the robot's way: passages without contact", "; ".join(figures), results[0][0]
+        "a sphere crosses the robot's way: passages without contact (the command is that of one task and speed)",
+        "; ".join(figures),
+        results[0][0],
     )
 
 
@@ -212,14 +216,13 @@ def _short(command: str) -> str:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the command's arguments."""
-    parser.add_argument("folder", type=Path, metavar="DIR", help="what a sitting has written")
+    parser.add_argument("folder", type=Path, nargs="?", default=KEPT, metavar="DIR", help="what a sitting has written")
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the command."""
-    KEPT.mkdir(exist_ok=True)
-    for path in sorted(options.folder.glob("*.json")):
-        shutil.copy(path, KEPT / path.name)
+    if options.folder.resolve() != KEPT:
+        shutil.copytree(options.folder, KEPT, ignore=shutil.ignore_patterns("*.md", "arrays"), dirs_exist_ok=True)
     for document in DOCUMENTS:
         document.write_text(filled(document.read_text(encoding="utf-8")), encoding="utf-8")
     return 0
