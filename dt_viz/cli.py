@@ -8,17 +8,19 @@ import os
 import secrets
 import signal
 import socket
+import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING
 
+from dt_viz.arguments import Parser
 from dt_viz.evaluate.__main__ import main as evaluate
 from dt_viz.picture import main as picture
 from dt_viz.ui.logs import RateLimitFilter
@@ -36,6 +38,7 @@ MAX_PORT = 65535
 PROG = "dt-viz"
 MAX_PROCESSES, MOST_BY_DEFAULT = 64, 4
 """Largest number of processes that may be asked for, and that are taken unasked."""
+COMPILING = "Compiling for this processor, once"
 LOADED = 2.0
 """Time, seconds, within which compiled code is loaded, so that nothing is said of it."""
 MAX_SESSIONS, MAX_WATCHING = 8, 50
@@ -81,6 +84,7 @@ def _serve(options: argparse.Namespace) -> int:
     # numerical libraries read these when they are first imported
     from dt_viz.errors import DataError, FormatError  # noqa: PLC0415
     from dt_viz.folders import default_cache_folder  # noqa: PLC0415
+    from dt_viz.kernels.compiled import is_complete  # noqa: PLC0415
     from dt_viz.learning.imitation import ImitationError  # noqa: PLC0415
     from dt_viz.learning.store import FitStore  # noqa: PLC0415
     from dt_viz.serving.board import Board, own_share  # noqa: PLC0415
@@ -133,6 +137,8 @@ def _serve(options: argparse.Namespace) -> int:
         begins=offered.begins,
         scenarios=offered.scenarios,
     )
+    if is_complete():
+        _compile(robot, threading.Event())  # processes that are forked from this one have it then, too
     prepare = partial(_prepare, fits, offered.tasks[offered.first](), robot)
     num_processes, num_connections = 1 if key else _num_processes(options.processes), max_sessions + MAX_WAITING
     with listening:
@@ -318,7 +324,7 @@ def _interruptible() -> Iterator[None]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog=PROG,
         description="Diffeomorphic transforms, live in the browser.",
         epilog=f"{PROG} {MEASURE} --help: the measurements of DT-Viz; {PROG} {PICTURE} --help: pictures of scenes",
@@ -473,6 +479,7 @@ def _prepare(fits: FitStore, task: Task, robot: Robot, share: Share, leaving: th
     try:
         if task.imitation is None and not has_orientations(task.demonstrations):  # else it is learned in milliseconds
             fits.get(task.demonstrations, progress=progress)
+        _compile_elsewhere(leaving)
         _compile(robot, leaving)
         share.prepared()
     except UnwantedError:
@@ -481,11 +488,41 @@ def _prepare(fits: FitStore, task: Task, robot: Robot, share: Share, leaving: th
         print(f"{PROG}: {error}", file=sys.stderr)
 
 
+def _compile_elsewhere(leaving: threading.Event) -> None:
+    """Compile what a drag repeats, unless it is kept, in processes of their own: what a compiler needs ends with them.
+
+    One begins with the last part, and loads in the end what the other one has compiled.
+    """
+    from dt_viz.files.processes import start_module  # noqa: PLC0415
+    from dt_viz.kernels.compiled import compiling_all  # noqa: PLC0415
+
+    bar, parts = _Bar(COMPILING), dict[str, float]()
+
+    def follow(order: str, told: IO[bytes]) -> None:
+        for line in told:
+            before, parts[order] = sum(parts.values()), float(line)
+            if before < 1:
+                bar(min(sum(parts.values()), 1.0))
+
+    with compiling_all() as wanted, ExitStack() as stack:
+        if not wanted:
+            return
+        processes = list[subprocess.Popen[bytes]]()
+        for order in ("forwards", "backwards")[: os.cpu_count()]:
+            process = start_module("dt_viz.avoidance", order, given=subprocess.PIPE, output=subprocess.PIPE)
+            processes.append(stack.enter_context(process))
+            threading.Thread(target=follow, args=(order, process.stdout)).start()
+        while any(process.poll() is None for process in processes):
+            if leaving.wait(0.1):
+                for process in processes:
+                    process.kill()
+
+
 def _compile(robot: Robot, leaving: threading.Event) -> None:
-    """Compile what a drag repeats: once for a processor, for half a minute; later it is only loaded."""
+    """Load what a drag repeats; compile what is not kept."""
     from dt_viz.avoidance.arm import WholeArm  # noqa: PLC0415
 
-    began, bar = time.monotonic(), _Bar("Compiling for this processor, once")
+    began, bar = time.monotonic(), _Bar(COMPILING)
     for fraction in WholeArm(robot).compiled():
         if time.monotonic() - began > LOADED:
             bar(fraction)

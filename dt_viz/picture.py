@@ -10,10 +10,11 @@ dt-viz picture mine.json --out mine.png
 
 from __future__ import annotations
 
-import argparse
 import os
 from collections.abc import Sequence
 from pathlib import Path
+
+from dt_viz.arguments import Parser
 
 OF = ("motion", "turntable", "warp")
 """What a video shows."""
@@ -21,7 +22,7 @@ OF = ("motion", "turntable", "warp")
 
 def main(arguments: Sequence[str], prog: str) -> int:
     """Make a picture; returns the process' exit status, or raises SystemExit where argparse does."""
-    parser = argparse.ArgumentParser(prog=prog, description=(__doc__ or "").splitlines()[0])
+    parser = Parser(prog=prog, description=(__doc__ or "").splitlines()[0])
     what = "a scene, such as fig-4 or its name, a task, tour-1 to 6, or the .json of a saved scenario"
     parser.add_argument("scene", metavar="SCENE", help=what)
     out = "a .png, .svg, .pdf, .html, .mp4 or .gif"

@@ -13,7 +13,18 @@ import dt_viz
 
 PACKAGE = Path(dt_viz.__file__).parent
 SOURCES = sorted(PACKAGE.rglob("*.py"))
-FOUNDATION = {"accounts", "checkpoints", "errors", "folders", "memo", "metrics", "numerics", "shipped", "warning"}
+FOUNDATION = {
+    "accounts",
+    "arguments",
+    "checkpoints",
+    "errors",
+    "folders",
+    "memo",
+    "metrics",
+    "numerics",
+    "shipped",
+    "warning",
+}
 """Modules of no package, which import each other only."""
 BELOW_SCENARIO = {"foundation", "flows", "files", "learning", "obstacles", "robot", "avoidance"}
 BELOW_SESSION = BELOW_SCENARIO | {"scenario", "motion", "control", "pictures"}
@@ -39,8 +50,8 @@ MAY_IMPORT: Mapping[str, set[str]] = {
     "evaluate": BELOW_SESSION | {"session", "baselines"},
     "examples": {"foundation"},
     "picture_making": BELOW_SESSION | {"saving", "session", "ui"},
-    "picture": {"picture_making"},
-    "cli": BELOW_SESSION | {"session", "serving", "ui", "evaluate", "saving", "picture"},
+    "picture": {"foundation", "picture_making"},
+    "cli": BELOW_SESSION | {"kernels", "session", "serving", "ui", "evaluate", "saving", "picture"},
     "__main__": {"cli"},
 }
 """The packages from the bottom up, and which of those below each may import."""

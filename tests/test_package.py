@@ -155,6 +155,7 @@ def test_the_package_is_a_command_too(environment, tmp_path):
 def test_the_page_of_the_installed_command_shows_the_motion(environment, tmp_path, browser):
     with started(environment, tmp_path) as (address, _):
         see_the_motion(browser, address, PATIENCE)
+    assert [*(tmp_path / "dt-viz" / "kernels").glob("complete-*")]  # what it waited for was compiled for all
 
 
 def test_without_demonstrations_the_command_ends_and_says_why(environment, tmp_path, without):

@@ -51,7 +51,7 @@ class WholeArm:
         self.limits = JointLimits(robot.lower, robot.upper)
         self._solver = partial(Solver, robot, self.body, self.limits)
 
-    def compiled(self) -> Iterator[float]:
+    def compiled(self, *, backwards: bool = False) -> Iterator[float]:
         """Compile what a drag repeats for this processor, or load what was compiled before; yields the part done."""
         robot, q, obstacle = self.robot, self.robot.home[None].copy(), Sphere((0.0, 0.0, 0.0))
         field = WholeArmField(robot, self.body, (obstacle,), np.eye(3)[:1], q[:0], 0.1)
@@ -77,7 +77,7 @@ class WholeArm:
             lambda: field(q),
             lambda: obstacle.field("free-space", 1.0)(np.zeros((1, 3))),  # the hand's fields
         )
-        for done, call in enumerate(calls, start=1):
+        for done, call in enumerate(reversed(calls) if backwards else calls, start=1):
             call()
             yield done / len(calls)
 

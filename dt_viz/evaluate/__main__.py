@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 
+from dt_viz.arguments import Parser
 from dt_viz.evaluate import THREADS
 
 BAD_INPUT = 2
@@ -64,7 +64,7 @@ def run_command(package: str, commands: Sequence[str], arguments: Sequence[str],
     )
     from dt_viz.learning.imitation import ImitationError  # noqa: PLC0415
 
-    parser = argparse.ArgumentParser(prog=prog, description="Measure DT-Viz.")
+    parser = Parser(prog=prog, description="Measure DT-Viz.")
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for name in commands:
         module = import_module(f"{package}.{name}")

@@ -3,6 +3,8 @@
 Compiling takes seconds a kernel, loading milliseconds. Files of the cache carry a checksum, are written whole or not at
 all, and are made anew where they are damaged. Without a folder that can be written, each process compiles for itself.
 The environment variable NUMBA_CACHE_DIR names another folder.
+
+A compiler keeps hundreds of megabytes. So a server has all compiled by a process that ends then: see `compiling_all`.
 """
 
 from __future__ import annotations
@@ -12,17 +14,23 @@ import logging
 import os
 import pickle
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
 from numba.core.compiler import CompileResult
-from numba.core.registry import CPUDispatcher
+from numba.core.registry import CPUDispatcher, cpu_target
 from numba.core.serialize import dumps
 
 from dt_viz.folders import default_cache_folder
+
+try:
+    import fcntl
+except ImportError:  # nobody waits for others there
+    fcntl = None
 
 logger = logging.getLogger(__name__)
 
@@ -69,6 +77,10 @@ class _Cache:
         """Return the code for these types of arguments; None where there is none, or it is damaged."""
         target_context.refresh()
         path = self._path(signature, target_context.codegen())
+        loaded = self._load(path, target_context)
+        return self._load(path, target_context) if loaded is None and _waited() else loaded
+
+    def _load(self, path: Path, target_context: Any) -> CompileResult | None:  # noqa: ANN401 - numba's
         try:
             checksum, data = (content := path.read_bytes())[:32], content[32:]
         except OSError:
@@ -87,14 +99,85 @@ class _Cache:
             unfinished.write_bytes(hashlib.sha256(data).digest() + data)
             unfinished.replace(path)
         except OSError as error:
-            unfinished.unlink(missing_ok=True)
+            with suppress(OSError):
+                unfinished.unlink()
             _say_once(str(error))
 
     def _path(self, signature: object, codegen: Any) -> Path:  # noqa: ANN401 - numba's
-        key = repr((signature, codegen.magic_tuple(), _version())).encode()
-        chosen = os.environ.get("NUMBA_CACHE_DIR")
-        folder = Path(chosen) if chosen else default_cache_folder() / "kernels"
-        return folder / f"{self._name}-{hashlib.sha256(key).hexdigest()[:24]}"
+        return _file(self._name, (signature, codegen.magic_tuple(), _version()))
+
+
+def _file(name: str, key: object) -> Path:
+    chosen = os.environ.get("NUMBA_CACHE_DIR")
+    folder = Path(chosen) if chosen else default_cache_folder() / "kernels"
+    return folder / f"{name}-{hashlib.sha256(repr(key).encode()).hexdigest()[:24]}"
+
+
+@contextmanager
+def compiling_all() -> Iterator[bool]:
+    """Keep all who need a kernel waiting within this block, in which another process compiles all for them.
+
+    Yields whether that is to be done: not where it is `complete`, somebody else does it, or nobody would wait.
+    """
+    path = _file("compiling", _version())
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lock = path.open("wb")
+    except OSError:  # nothing can be kept
+        yield False
+        return
+    with lock:
+        yield not is_complete() and _locked(lock.fileno())
+
+
+def complete() -> None:
+    """Note that all kernels are compiled, so that no process begins anew to compile all."""
+    with suppress(OSError):
+        _complete().touch()
+
+
+def is_complete() -> bool:
+    """Return whether all kernels are compiled, and kept."""
+    return _complete().exists()
+
+
+def wait_for_nobody() -> None:
+    """Have this process compile what it needs, for others that wait."""
+    global _waits  # noqa: PLW0603 - a property of the process
+    _waits = False
+
+
+_waits = True
+
+
+def _waited() -> bool:
+    """Wait while another process compiles all; return whether one did."""
+    if not _waits or fcntl is None:
+        return False
+    try:
+        with _file("compiling", _version()).open("rb") as lock:
+            if _locked(lock.fileno(), exclusive=False):
+                return False
+            fcntl.flock(lock.fileno(), fcntl.LOCK_SH)
+            return True
+    except OSError:
+        return False
+
+
+def _locked(lock: int, *, exclusive: bool = True) -> bool:
+    """Lock a file by its descriptor, for as long as it is open; return whether that was possible at once."""
+    if fcntl is None:
+        return False
+    try:
+        fcntl.flock(lock, (fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH) | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
+
+
+def _complete() -> Path:
+    """File that is there where all is compiled."""
+    return _file("complete", (cpu_target.target_context.codegen().magic_tuple(), _version()))
 
 
 @lru_cache(maxsize=1)

@@ -17,7 +17,6 @@ from dt_viz.flows.diffeomorphisms import Conjugated, Diffeomorphism, Flow
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.rollouts import ARRIVED
 from dt_viz.flows.rotations import apart
-from dt_viz.motion.following import MAX_TRACKING_ERROR
 from dt_viz.motion.stack import Solution
 from dt_viz.robot.collision import CollisionReport
 from dt_viz.robot.robot import Robot
@@ -34,9 +33,6 @@ MAX_OFF_POSTURE = 1e-5
 millimetres are 4e-4 where it squeezes most."""
 POSTURE_TOLERANCE = 1e-7
 """Tolerance of a step of ψ_q's flow, rad, at every posture: half as costly as the one that the motion is made with."""
-MAX_OFF_TRACKED = MAX_TRACKING_ERROR
-"""`MAX_OFF` where the hand follows the motion by the joints: a spline between postures on it leaves up to 1e-5, joints
-at their limits leave more."""
 RESOLVED = 1e-5
 """Distance between samples in base space, metres, up to which whether Φ falls is rounding."""
 MAX_ROUND_TRIP = 1e-6

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dt_viz.checkpoints import checkpoint
 from dt_viz.errors import FormatError
 from dt_viz.flows.fields import Array
 
@@ -112,10 +113,18 @@ def encoded(figure: Figure, suffix: str) -> bytes:
     """Return a figure as the content of a file with a suffix such as ".svg"; its text stays text."""
     from matplotlib import rc_context  # noqa: PLC0415 - an extra
 
-    file = io.BytesIO()
+    file = _Written()
     with rc_context({"svg.fonttype": "none", "pdf.fonttype": 42}):
         figure.savefig(file, format=suffix[1:], dpi=120)
     return file.getvalue()
+
+
+class _Written(io.BytesIO):
+    """A file in memory, with a checkpoint at each piece that is written: drawing a figure takes a second."""
+
+    def write(self, content: Any, /) -> int:  # noqa: ANN401 - as that of io
+        checkpoint()
+        return super().write(content)
 
 
 def save(figure: Figure, *paths: Path) -> None:
@@ -240,6 +249,7 @@ def scene_figure(drawings: Sequence[Drawing], settings: PrintSettings | None = N
     points_per_metre = 72 * whole / columns / float(extents[:, 0].max())
     named: dict[str, Any] = {}
     for axes, drawing in zip(grid, drawings, strict=False):
+        checkpoint()
         axes.set(xlim=(drawing.lower[0], drawing.upper[0]), ylim=(drawing.lower[1], drawing.upper[1]), aspect="equal")
         axes.set_title(drawing.title, fontsize=size.type_size)
         _draw(axes, drawing, size, points_per_metre, named)

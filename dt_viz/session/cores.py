@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -27,6 +28,8 @@ class CoresSettings:
     """Interval at which what waits and may be cancelled asks whether it is still wanted, unless it is woken before."""
     longest: float = 0.25
     """Longest time for which who has overdrawn, or refines, gives way at once: he goes on, if slowly."""
+    turn: float = 0.0005
+    """Time for which a thread keeps the interpreter while another one waits for it, beside `Cores.short_turns`."""
 
 
 class Rank(IntEnum):
@@ -72,6 +75,8 @@ class Cores:
         """Those who wait; the smallest is next."""
         self._held: list[_Place] = []
         """Those who have a slot."""
+        self._num_long, self._usual_turn = 0, sys.getswitchinterval()
+        """Number of blocks of `short_turns`, and a thread's turn while there are none, seconds."""
 
     @contextmanager
     def slot(self, rank: Rank = Rank.HAND, cancelled: Cancelled = never) -> Iterator[None]:
@@ -126,6 +131,26 @@ class Cores:
                 return all(place.debt >= debt for place in others)
 
             self._left.wait_for(is_last, self._settings.longest)
+
+    @contextmanager
+    def short_turns(self) -> Iterator[None]:
+        """Have threads take turns ten times sooner within this block, which holds the interpreter for long.
+
+        A frame of a drag asks for the interpreter dozens of times, and each time waits for the turn of who computes.
+        Where only frames are computed, short turns make all of them slower.
+        """
+        with self._lock:
+            self._num_long += 1
+            if self._num_long == 1:
+                self._usual_turn = sys.getswitchinterval()
+                sys.setswitchinterval(min(self._usual_turn, self._settings.turn))
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._num_long -= 1
+                if not self._num_long:
+                    sys.setswitchinterval(self._usual_turn)
 
     def _let_hands_go_first(self, cancelled: Cancelled) -> None:
         """Pause for a while if another slot follows a hand. Raises UnwantedError if it is cancelled.

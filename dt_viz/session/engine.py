@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterator, Mapping
-from contextlib import AbstractContextManager
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import TypeVar
 
@@ -114,9 +114,11 @@ class Engine:
             del self.own[oldest]
         return task, oldest
 
-    def refining(self, cancelled: Cancelled) -> AbstractContextManager[None]:
+    @contextmanager
+    def refining(self, cancelled: Cancelled) -> Iterator[None]:
         """Wait for a core, and have it, as what refines has: whoever drags comes first. Raises as `Cores.slot`."""
-        return _cores.slot(Rank.REFINEMENT, cancelled)
+        with _cores.slot(Rank.REFINEMENT, cancelled), _cores.short_turns():
+            yield
 
     def frames(
         self,
@@ -221,7 +223,8 @@ class Engine:
         return self._learn(scenario, self.own[scenario.task][1], progress)
 
     def _learn(self, scenario: Scenario, fits: FitStore, progress: Progress | None) -> Learned:
-        learned = learned_of(scenario, self.task(scenario.task), fits, progress)
+        with _cores.short_turns():
+            learned = learned_of(scenario, self.task(scenario.task), fits, progress)
         imitation = learned.imitation
         if isinstance(imitation, AugmentedImitation) and learned.poses and self.follower.unreached(learned):
             places = replace(imitation, goal_orientation=None, warnings=(*imitation.warnings, NOT_TURNED))

@@ -209,6 +209,7 @@ class Gate:
             GateError: viser does not start its server as expected.
         """
         patches.tell_from_threads()
+        patches.evaluate_hints_once()
         patches.report_failures(lambda error: logger.error("a callback failed", exc_info=error))
         self._server = patches.open_server(self._guarded, listening, label=label, verbose=False)
         return self._server

@@ -76,12 +76,12 @@ class Keeper:
         """The session, and what has it go on with something."""
         self._said: list[str] = []
         """What the visitor has been told, or will be once there is a session."""
-        self._found: str | None = None
-        """Text that the browser had at first."""
+        self._kept: str | None = None
+        """Text that the browser has, as far as is known."""
         self._written: str | None = None
         """Text that was written last, or that needs no writing."""
-        self._proven = False
-        """Whether the browser was asked if it keeps what it is told."""
+        self._proven = 0
+        """Number of characters of the longest text of which the browser was asked if it keeps it."""
         self._first: Scenario | None = None
         """Scenario that the page shows until it goes on with what the browser keeps; None if it does, or need not."""
         self.begun: Saved | None = None
@@ -145,9 +145,9 @@ class Keeper:
     def _ask(self) -> bool:
         """Ask the browser what it keeps, which then is `begun`; return whether it has answered."""
         try:
-            self._found = self._storage.get_item(KEY, timeout=PATIENCE)
-            if self._found is not None:
-                self.begun = decode(self._found, self._known, "What this browser keeps")
+            self._kept = self._storage.get_item(KEY, timeout=PATIENCE)
+            if self._kept is not None:
+                self.begun = decode(self._kept, self._known, "What this browser keeps")
         except TimeoutError:
             self._say(SLOW)
             return False
@@ -186,12 +186,12 @@ class Keeper:
         if text is None or text == self._written:
             return
         self._storage.set_item(KEY, text)
-        self._written = text
-        if not self._proven:
+        before, self._kept, self._written = self._kept, text, text
+        if len(text) > self._proven:
             with suppress(TimeoutError, RuntimeError):  # it is busy, or gone
-                full = self._storage.get_item(KEY, timeout=PATIENCE) == self._found != text
-                self._proven = True
-                if full:
+                self._kept = self._storage.get_item(KEY, timeout=PATIENCE)
+                self._proven = len(text)
+                if self._kept == before != text:  # else it is another tab's
                     self._say(FULL)
         session.jobs.pause(PAUSE * max(1.0, len(text) / SMALL))
 

@@ -135,31 +135,32 @@ class Visitor(Display):
         pen = Pen(self.pictures, lambda: self.robot, lambda: self.session, self._face)
         self._keeper = Keeper(client.local_storage, known_names(titles, titled), self._made, begins)
         self._camera = CameraController(client, lambda: self.robot.hand, robot.size, self._keeper.changed)
-        self._panel = ControlPanel(
-            client.gui,
-            titles,
-            robot,
-            titled,
-            lambda resolution, transparent, cancelled: self.render(
-                RESOLUTIONS[resolution], transparent=transparent, cancelled=cancelled
-            ),
-            self._send,
-            partial(notify, client, seconds=BRIEF),
-            self._camera,
-            self._darken,
-            partial(self._preview, pen),
-            self._keeper.forget,
-            self._save,
-            self._record,
-            lambda what, suffix, resolution, step, cancelled: self.film(
-                what, suffix, RESOLUTIONS[resolution], step, cancelled
-            ),
-            self._open,
-            pen,
-            client.local_storage,
-            self._came_back,
-            {name: partial(self._resume, saved) for name, saved in scenarios.items()},
-        )
+        with client.atomic():
+            self._panel = ControlPanel(
+                client.gui,
+                titles,
+                robot,
+                titled,
+                lambda resolution, transparent, cancelled: self.render(
+                    RESOLUTIONS[resolution], transparent=transparent, cancelled=cancelled
+                ),
+                self._send,
+                partial(notify, client, seconds=BRIEF),
+                self._camera,
+                self._darken,
+                partial(self._preview, pen),
+                self._keeper.forget,
+                self._save,
+                self._record,
+                lambda what, suffix, resolution, step, cancelled: self.film(
+                    what, suffix, RESOLUTIONS[resolution], step, cancelled
+                ),
+                self._open,
+                pen,
+                client.local_storage,
+                self._came_back,
+                {name: partial(self._resume, saved) for name, saved in scenarios.items()},
+            )
         begun = self._keeper.begun
         at_once = None if begun is None or _takes_long(begun) else begun.scenario
         display = self if share is None else Counted(self, share)

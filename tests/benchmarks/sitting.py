@@ -5,7 +5,6 @@ Each command runs in a process of its own; what it prints as tables is put toget
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import platform
@@ -18,6 +17,7 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
+from dt_viz.arguments import Parser
 from dt_viz.evaluate.__main__ import COMMANDS
 
 LASA = "LASA"
@@ -117,7 +117,7 @@ SUBJECTS: Mapping[str, Subject] = {
 
 def main(arguments: Sequence[str], prog: str) -> int:
     """Measure subjects; returns 1 if one of the commands failed."""
-    parser = argparse.ArgumentParser(prog=prog, description="Measure most figures of the documents.")
+    parser = Parser(prog=prog, description="Measure most figures of the documents.")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the tables")
     parser.add_argument("--only", nargs="+", choices=tuple(SUBJECTS), default=list(SUBJECTS), help="(default: all)")
     parser.add_argument(

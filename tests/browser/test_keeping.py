@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import browsing
+import numpy as np
 import pytest
 from browsing import (
     PATIENCE,
@@ -34,8 +35,13 @@ APP = Path(dt_viz.__file__).parent.parent / "app.py"
 
 def kept(page):
     """The scenario that the browser keeps; None if it keeps nothing."""
+    return None if (saved := saved_in(page)) is None else saved.scenario
+
+
+def saved_in(page):
+    """The same with its camera."""
     text = browsing.kept(page)
-    return None if text is None else decode(text, Known(tuple(TASKS))).scenario
+    return None if text is None else decode(text, Known(tuple(TASKS)))
 
 
 @pytest.fixture
@@ -70,6 +76,7 @@ def test_after_a_reload_the_visitor_finds_what_he_has_made(visit, server):
     wait_until(lambda: kept(page) == visitor.session.scenario, "the browser to keep it")
     until_drawn(visitor)
     seen = visitor.client.camera.position, visitor.client.camera.look_at
+    wait_until(lambda: np.allclose(saved_in(page).camera, seen, atol=2e-3), "the browser to keep the camera")
     again = reload(page, server)
     assert again.session.scenario == visitor.session.scenario
     page.get_by_text(re.compile("· as saved$")).wait_for()
@@ -97,6 +104,30 @@ def test_a_browser_that_is_not_allowed_to_keep_anything_says_so_and_the_page_goe
     assert again.session.wait_idle(PATIENCE)
     page.close()
     page_errors.clear()  # of what is forbidden
+
+
+def test_a_browser_without_room_says_so_and_the_page_goes_on(visit, server):
+    page, visitor = visit
+    made = visitor.session.scenario
+    wait_until(lambda: kept(page) == made, "the browser to keep it")
+    page.evaluate(
+        """() => {
+            for (let text = 'x'.repeat(2 ** 20), number = 0; text; number++)
+                try { localStorage.setItem(`filler-${number}`, text); }
+                catch { text = text.slice(text.length / 2 + 1); }
+        }"""
+    )
+    add(page, "Box")
+    page.get_by_text(keeping.FULL).first.wait_for()
+    assert kept(page) == made
+    assert visitor.session.wait_idle(PATIENCE) and len(visitor.session.scenario.obstacles) == 2
+    again = reload(page, server)
+    assert len(again.session.scenario.obstacles) == 1
+    page.evaluate("localStorage.clear()")
+    add(page, "Cylinder")
+    wait_until(lambda: kept(page) == again.session.scenario, "the browser, which has room again, to keep it")
+    page.close()
+    page_errors.clear()  # of what had no room
 
 
 # --- another process ---

@@ -160,9 +160,9 @@ def test_each_worker_computes_what_one_process_does_keeps_what_items_share_and_i
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ("--jobs 0", "argument --jobs: found '0'; accepted: a whole number, 1 to "),
-        ("--jobs -1", "argument --jobs: found '-1'; accepted: a whole number, 1 to "),
-        ("--jobs 100000", "argument --jobs: found '100000'; accepted: a whole number, 1 to "),
+        ("--jobs 0", "--jobs: found '0'; accepted: a whole number, 1 to "),
+        ("--jobs -1", "--jobs: found '-1'; accepted: a whole number, 1 to "),
+        ("--jobs 100000", "--jobs: found '100000'; accepted: a whole number, 1 to "),
         ("--jobs 2 --dask tcp://127.0.0.1:1", "not allowed with argument --jobs"),
         ("--dask tcp://127.0.0.1:1", "--dask: found 'tcp://127.0.0.1:1', where no scheduler answers"),
         ("--dask tcp://127.0.0.1", "--dask: found 'tcp://127.0.0.1', where no scheduler answers"),

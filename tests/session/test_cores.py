@@ -1,7 +1,8 @@
 """Slots: no more at once than there are, who follows a hand first, and nobody is left out."""
 
+import sys
 import threading
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from time import monotonic, thread_time
 
 import pytest
@@ -334,3 +335,12 @@ def test_a_refinement_that_is_cancelled_ends_at_its_next_checkpoint():
         unwanted.set()
         checkpoint()
         pytest.fail("it went on")
+
+
+def test_threads_take_short_turns_beside_what_computes_for_long_and_usual_ones_after_it():
+    cores, usual = Cores(), sys.getswitchinterval()
+    with cores.short_turns():
+        with suppress(UnwantedError), cores.short_turns():
+            raise UnwantedError
+        assert sys.getswitchinterval() <= 0.001
+    assert sys.getswitchinterval() == usual

@@ -13,7 +13,9 @@ from pages import Page, wait_until
 from PIL import Image
 from viser._gui_handles import GuiProgressBarHandle  # noqa: TID251
 
+from dt_viz.checkpoints import checked
 from dt_viz.control.settings import ControllerSettings
+from dt_viz.errors import UnwantedError
 from dt_viz.session.frame import Stage
 from dt_viz.ui.scene import figure
 from dt_viz.ui.scene.figure import SUFFIXES, render_figure
@@ -178,6 +180,20 @@ def test_a_browser_that_gives_no_png_is_told_of_in_a_line(saving, frame, monkeyp
     sent, said = press(saving, "Save picture")
     answers.set()
     assert not sent and said.startswith("Save picture: the browser, its page out of sight perhaps, drew nothing")
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_figure_that_is_drawn_lets_others_go_first_many_times_and_ends_when_it_is_cancelled(frame, suffix):
+    asked = []
+    with checked(lambda: asked.append(True)):
+        render_figure(frame, suffix)
+    assert len(asked) > 100
+
+    def end():
+        raise UnwantedError
+
+    with checked(end), pytest.raises(UnwantedError):
+        render_figure(frame, suffix)
 
 
 def texts(svg):

@@ -7,6 +7,7 @@ from functools import partial
 
 import viser
 
+from dt_viz.checkpoints import checkpoint
 from dt_viz.errors import Cancelled, FormatError, end_if
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import Bindings
@@ -60,6 +61,7 @@ class SaveButton:
 
         def step(fraction: float) -> None:
             end_if(cancelled)
+            checkpoint()
             self._bar.value, self._bar.visible = 100 * fraction, True
 
         label, self.button.label = self._label, CANCEL

@@ -1,0 +1,27 @@
+"""Compile what a drag repeats, for a server that waits, until that closes the standard input; prints the parts done."""
+
+import os
+import sys
+import threading
+
+from dt_viz.avoidance.arm import WholeArm
+from dt_viz.kernels.compiled import complete, wait_for_nobody
+from dt_viz.robot.models import load_jaco
+
+
+def _end_with_server() -> None:
+    sys.stdin.read()  # it gets nothing
+    os._exit(1)
+
+
+def main() -> None:
+    """Compile."""
+    threading.Thread(target=_end_with_server, daemon=True).start()
+    wait_for_nobody()
+    for fraction in WholeArm(load_jaco()).compiled(backwards=sys.argv[1:] == ["backwards"]):
+        print(fraction, flush=True)
+    complete()
+
+
+if __name__ == "__main__":
+    main()
