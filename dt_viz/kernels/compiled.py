@@ -177,7 +177,8 @@ def _locked(lock: int, *, exclusive: bool = True) -> bool:
 
 def _complete() -> Path:
     """File that is there where all is compiled."""
-    return _file("complete", (cpu_target.target_context.codegen().magic_tuple(), _version()))
+    context: Any = cpu_target.target_context
+    return _file("complete", (context.codegen().magic_tuple(), _version()))
 
 
 @lru_cache(maxsize=1)

@@ -172,9 +172,16 @@ class Soaked:
             if is_same(state, found):
                 self.ages.append(0.0 if k == len(had) - 1 else lost - had[k + 1][0])
                 whole = k == len(had) - 1 or had[k + 1][1] > edit
-                self.num_lost += not (edit >= last or (edit == last - 1 and whole))
+                if not (edit >= last or (edit == last - 1 and whole)):
+                    self._loses(found, had, lost)
                 return
+        self._loses(found, had, lost)
+
+    def _loses(self, found: State, had: Sequence[tuple[float, int, State | None]], lost: float) -> None:
+        """Count an edit that was not found again, and tell what there was in the seconds before."""
         self.num_lost += 1
+        lately = [f"{when - lost:.2f} s: edit {edit}, {state}" for when, edit, state in had if when > lost - 2]
+        print(f"an edit was lost: found {found} of", *lately, sep="\n    ", file=sys.stderr)
 
 
 async def _rest(client: ProtocolClient, seconds: float) -> None:

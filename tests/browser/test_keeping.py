@@ -35,13 +35,17 @@ APP = Path(dt_viz.__file__).parent.parent / "app.py"
 
 def kept(page):
     """The scenario that the browser keeps; None if it keeps nothing."""
-    return None if (saved := saved_in(page)) is None else saved.scenario
-
-
-def saved_in(page):
-    """The same with its camera."""
     text = browsing.kept(page)
-    return None if text is None else decode(text, Known(tuple(TASKS)))
+    return None if text is None else decode(text, Known(tuple(TASKS))).scenario
+
+
+def kept_camera(page):
+    """Where the camera is, and where it looks, as the browser keeps it."""
+    text = browsing.kept(page)
+    assert text is not None
+    camera = decode(text, Known(tuple(TASKS))).camera
+    assert camera is not None
+    return camera
 
 
 @pytest.fixture
@@ -76,7 +80,7 @@ def test_after_a_reload_the_visitor_finds_what_he_has_made(visit, server):
     wait_until(lambda: kept(page) == visitor.session.scenario, "the browser to keep it")
     until_drawn(visitor)
     seen = visitor.client.camera.position, visitor.client.camera.look_at
-    wait_until(lambda: np.allclose(saved_in(page).camera, seen, atol=2e-3), "the browser to keep the camera")
+    wait_until(lambda: np.allclose(kept_camera(page), seen, atol=2e-3), "the browser to keep the camera")
     again = reload(page, server)
     assert again.session.scenario == visitor.session.scenario
     page.get_by_text(re.compile("· as saved$")).wait_for()

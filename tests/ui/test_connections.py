@@ -11,6 +11,7 @@ import urllib.request
 from contextlib import AsyncExitStack, asynccontextmanager, closing, nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import get_type_hints
 
 import msgspec
 import numpy as np
@@ -652,6 +653,14 @@ def test_a_viser_with_other_messages_is_refused(monkeypatch):
     monkeypatch.delattr("viser._messages.SceneNodeDragMessage")
     with pytest.raises(GateError, match=r"SceneNodeDragMessage.*; accepted: viser 1\.1"):
         a_gate()
+
+
+def test_the_types_of_properties_are_evaluated_once_for_each_class(server):
+    scene = server._server.scene
+    handles = [scene.add_frame("/typed"), scene.add_frame("/typed/too"), scene.add_label("/typed/label", "")]
+    hints = [handle._prop_hints for handle in handles]
+    assert hints[0] is hints[1] and hints == [get_type_hints(type(handle._impl.props)) for handle in handles]
+    handles[0].remove()
 
 
 @pytest.mark.parametrize("path", ["/", "/window/a", "/window/a/9999999", "/window/a/20", "/window/a b/390", "/390"])
