@@ -137,10 +137,10 @@ def _serve(options: argparse.Namespace) -> int:
         begins=offered.begins,
         scenarios=offered.scenarios,
     )
-    if is_complete():
-        _compile(robot, threading.Event())  # processes that are forked from this one have it then, too
     prepare = partial(_prepare, fits, offered.tasks[offered.first](), robot)
     num_processes, num_connections = 1 if key else _num_processes(options.processes), max_sessions + MAX_WAITING
+    if num_processes > 1 and is_complete():
+        _compile(robot, threading.Event())  # processes that are forked from this one have it then, too
     with listening:
         if num_processes == 1:
             return _work(new_server, prepare, own_share(num_connections), listening, ready)
@@ -489,9 +489,9 @@ def _prepare(fits: FitStore, task: Task, robot: Robot, share: Share, leaving: th
 
 
 def _compile_elsewhere(leaving: threading.Event) -> None:
-    """Compile what a drag repeats, unless it is kept, in processes of their own: what a compiler needs ends with them.
+    """Compile what a drag repeats, unless it is kept, in two processes: a compiler's memory is freed only with them.
 
-    One begins with the last part, and loads in the end what the other one has compiled.
+    One begins with the first kernel, the other with the last; each loads what the other has compiled.
     """
     from dt_viz.files.processes import start_module  # noqa: PLC0415
     from dt_viz.kernels.compiled import compiling_all  # noqa: PLC0415

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from demo import PATIENCE, address, started
 
+from dt_viz import cli
 from dt_viz.cli import main
 from dt_viz.evaluate.protocol_client import LostError, ProtocolClient
 from dt_viz.learning import store
@@ -212,6 +213,18 @@ def test_handlers_of_signals_are_as_before_when_it_returns(capsys):
     assert main(["--task", "nothing"]) == 2
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
     assert "found 'nothing'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("processes", "kept", "loads"), [("2", True, 1), ("2", False, 0), ("1", True, 0)])
+def test_several_processes_share_the_compiled_code_that_is_kept(monkeypatch, processes, kept, loads):
+    """What the supervisor loads before it forks, a process that takes a dead one's place has at once."""
+    loaded = []
+    monkeypatch.setattr("dt_viz.kernels.compiled.is_complete", lambda: kept)
+    monkeypatch.setattr(cli, "_compile", lambda *_what: loaded.append(True))
+    monkeypatch.setattr(cli, "_work", lambda *_what: 0)
+    monkeypatch.setattr("dt_viz.serving.supervisor.Supervisor.run", lambda _supervisor: 0)
+    assert main(["--port", "0", "--processes", processes]) == 0
+    assert len(loaded) == loads
 
 
 def test_the_key_of_the_presenter_is_printed_and_another_one_each_time(monkeypatch, capsys):

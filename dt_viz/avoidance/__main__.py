@@ -1,4 +1,7 @@
-"""Compile what a drag repeats, for a server that waits, until that closes the standard input; prints the parts done."""
+"""Compile what a drag repeats for a server, which waits; ends with the server. Prints the part done, line by line.
+
+The argument `backwards` has it begin with the last kernel.
+"""
 
 import os
 import sys

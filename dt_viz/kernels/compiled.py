@@ -4,7 +4,8 @@ Compiling takes seconds a kernel, loading milliseconds. Files of the cache carry
 all, and are made anew where they are damaged. Without a folder that can be written, each process compiles for itself.
 The environment variable NUMBA_CACHE_DIR names another folder.
 
-A compiler keeps hundreds of megabytes. So a server has all compiled by a process that ends then: see `compiling_all`.
+A process that compiles keeps hundreds of megabytes until it ends. A server therefore has other processes compile all
+kernels, and only loads them: see `compiling_all`.
 """
 
 from __future__ import annotations
@@ -115,9 +116,10 @@ def _file(name: str, key: object) -> Path:
 
 @contextmanager
 def compiling_all() -> Iterator[bool]:
-    """Keep all who need a kernel waiting within this block, in which another process compiles all for them.
+    """Have all processes that need a kernel wait for the end of this block, in which others compile all kernels.
 
-    Yields whether that is to be done: not where it is `complete`, somebody else does it, or nobody would wait.
+    Yields whether they are to be compiled: not where they are `complete`, another server has that done, or nothing can
+    be kept. Those that compile call `wait_for_nobody`.
     """
     path = _file("compiling", _version())
     try:
@@ -137,12 +139,12 @@ def complete() -> None:
 
 
 def is_complete() -> bool:
-    """Return whether all kernels are compiled, and kept."""
+    """Return whether all kernels of this version are compiled for this processor, and kept."""
     return _complete().exists()
 
 
 def wait_for_nobody() -> None:
-    """Have this process compile what it needs, for others that wait."""
+    """Have this process compile the kernels that it needs: others wait for it."""
     global _waits  # noqa: PLW0603 - a property of the process
     _waits = False
 

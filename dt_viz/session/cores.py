@@ -134,10 +134,10 @@ class Cores:
 
     @contextmanager
     def short_turns(self) -> Iterator[None]:
-        """Have threads take turns ten times sooner within this block, which holds the interpreter for long.
+        """Have threads switch ten times as often within this block, whose computation holds the interpreter for long.
 
-        A frame of a drag asks for the interpreter dozens of times, and each time waits for the turn of who computes.
-        Where only frames are computed, short turns make all of them slower.
+        A frame of a drag asks for the interpreter dozens of times, and each time waits until the thread that has it has
+        had its turn. Where only frames are computed, short turns make all of them slower.
         """
         with self._lock:
             self._num_long += 1

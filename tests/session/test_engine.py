@@ -2,6 +2,7 @@
 
 import gc
 import itertools
+import sys
 import threading
 import weakref
 from dataclasses import replace
@@ -14,8 +15,9 @@ from scenes import avoiding, biases, changed, frame_at, kinds, says
 import dt_viz.session.engine as engine_module
 from dt_viz.avoidance.bias import MAX_TARGET_MISS, BiasPoint
 from dt_viz.avoidance.passing import ANEW
-from dt_viz.errors import UnwantedError
+from dt_viz.errors import UnwantedError, never
 from dt_viz.flows import rollouts
+from dt_viz.learning.store import FitStore
 from dt_viz.memo import Memo
 from dt_viz.metrics import distance_from_path, maximum_collision_distance
 from dt_viz.motion import diagnostics
@@ -437,3 +439,19 @@ def test_a_bias_point_that_motions_pass_giving_way_is_said_with_the_distance(eng
     off = replace(scenario, stack=switched(scenario, "Bias 1"))
     for quiet in (off, replace(scenario, warp=0.5), changed(scenario, avoids=False)):
         assert not says(frame_at(engine, quiet, Stage.ROLLOUTS), "Bias 1")
+
+
+def test_threads_switch_often_while_the_engine_learns_or_a_file_is_made(engine, initial, monkeypatch):
+    usual, while_learning = sys.getswitchinterval(), []
+    learned_of = engine_module.learned_of
+
+    def watched(*what):
+        while_learning.append(sys.getswitchinterval())
+        return learned_of(*what)
+
+    monkeypatch.setattr(engine_module, "learned_of", watched)
+    engine._learn(initial("draw_s"), FitStore(None), None)
+    assert len(while_learning) == 1 and while_learning[0] < usual / 2
+    with engine.refining(never):
+        assert sys.getswitchinterval() < usual / 2
+    assert sys.getswitchinterval() == usual
