@@ -162,6 +162,21 @@ def press(locator):
     locator.click(force=True)
 
 
+def click_at(page, bar, part, done, what):
+    """Click at a part of a slider's bar until that is done: the bar may still be on its way, or covered by a notice."""
+    wait_until(lambda: bar.bounding_box() is not None, f"the bar of {what}")
+    for _ in range(TRIES):
+        close_notices(page)
+        box = bar.bounding_box()
+        page.mouse.click(box["x"] + part * box["width"], box["y"] + box["height"] / 2)
+        deadline = time.monotonic() + PATIENCE / TRIES
+        while time.monotonic() < deadline:
+            if done():
+                return
+            time.sleep(0.05)
+    pytest.fail(f"{TRIES} clicks in vain for {what}")
+
+
 def travel(page, name):
     """Press a button of the history once the page has been told that there is such a step."""
     button = page.get_by_role("button", name=name, exact=True)

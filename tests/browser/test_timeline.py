@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from browsing import LIGHT, begin, close_page, open_page, open_tab, press, until_drawn, wait_until
+from browsing import LIGHT, begin, click_at, close_page, open_page, open_tab, press, until_drawn, wait_until
 from chromium import needs_chromium
 
 from dt_viz.metrics import interpolate
@@ -39,10 +39,9 @@ def test_what_the_robot_did_is_scrubbed_stepped_and_played(browser, server, init
     player = playback.past
     assert playback.player is player and np.ptp(player.motion.q, axis=0).max() > 0.1
     bar = time.locator("xpath=ancestor::div[.//*[@role='slider']][1]").locator(".mantine-Slider-track")
-    box = bar.bounding_box()
     for part in (0.8, 0.3):
-        page.mouse.click(box["x"] + part * box["width"], box["y"] + box["height"] / 2)
-        wait_until(lambda: abs(player.moment / player.duration - part) < 0.08, "the moment that is clicked")  # noqa: B023
+        is_there = lambda: abs(player.moment / player.duration - part) < 0.08  # noqa: B023, E731
+        click_at(page, bar, part, is_there, "the moment that is clicked")
         wait_until(as_recorded, "the arm as it was then")
     page.evaluate("document.activeElement.blur()")
     before = player.moment
