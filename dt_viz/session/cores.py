@@ -27,7 +27,9 @@ class CoresSettings:
     look: float = 0.25
     """Interval at which what waits and may be cancelled asks whether it is still wanted, unless it is woken before."""
     longest: float = 0.25
-    """Longest time for which who has overdrawn, or refines, gives way at once: he goes on, if slowly."""
+    """Longest time for which who has overdrawn, refines or moves an arm gives way at once: he goes on, if slowly."""
+    pause: float = 0.05
+    """Longest time for which an arm whose turn it is to be moved waits while a hand is followed."""
     turn: float = 0.0005
     """Time for which a thread keeps the interpreter while another one waits for it, beside `Cores.short_turns`."""
 
@@ -75,6 +77,8 @@ class Cores:
         """Those who wait; the smallest is next."""
         self._held: list[_Place] = []
         """Those who have a slot."""
+        self._between = threading.Lock()
+        """Held by one of those within `between_hands`."""
         self._num_long, self._usual_turn = 0, sys.getswitchinterval()
         """Number of blocks of `short_turns`, and a thread's turn while there are none, seconds."""
 
@@ -133,6 +137,22 @@ class Cores:
             self._left.wait_for(is_last, self._settings.longest)
 
     @contextmanager
+    def between_hands(self) -> Iterator[None]:
+        """Wait for a moment in which no slot follows a hand and nobody else is within this block; for a while at most.
+
+        For what takes a few milliseconds and comes again and again, as each picture of each arm. Threads that compute
+        at once share one interpreter: all of them, and the frames of a drag with them, take several times as long.
+        """
+        alone = self._between.acquire(timeout=self._settings.longest)
+        try:
+            with self._left:
+                self._left.wait_for(self._no_hand_is_followed, self._settings.pause)
+            yield
+        finally:
+            if alone:
+                self._between.release()
+
+    @contextmanager
     def short_turns(self) -> Iterator[None]:
         """Have threads switch ten times as often within this block, whose computation holds the interpreter for long.
 
@@ -158,10 +178,11 @@ class Cores:
         A hand that waits is no reason: with a single slot it waits for this refinement.
         """
         with self._left:
-            self._left.wait_for(
-                lambda: cancelled() or all(place.rank is not Rank.HAND for place in self._held), self._settings.longest
-            )
+            self._left.wait_for(lambda: cancelled() or self._no_hand_is_followed(), self._settings.longest)
         end_if(cancelled)
+
+    def _no_hand_is_followed(self) -> bool:
+        return all(place.rank is not Rank.HAND for place in self._held)
 
     def giving_way(self, cancelled: Cancelled) -> Cancelled:
         """Return the same question, which gives way whenever it is asked: between parts of what takes long."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from typing import TypeVar
 
@@ -53,6 +53,11 @@ _cores = Cores()
 def wake(thread: int) -> None:
     """Have what waits for a slot on a thread ask whether it is still wanted."""
     _cores.wake(thread)
+
+
+def between_hands() -> AbstractContextManager[None]:
+    """Wait for a moment to move an arm in, and have it within the block; see `Cores.between_hands`."""
+    return _cores.between_hands()
 
 
 class Engine:

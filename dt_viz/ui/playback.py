@@ -6,6 +6,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 
@@ -215,9 +216,20 @@ class Playback:
         playing, speed = (self._playing, self._speed) if player is None else (player.playing, player.speed)
         return speed if playing else 0.0
 
-    def begin(self, jobs: Jobs, fail: Callable[[Exception], None]) -> None:
-        """Move the arm until the jobs are closed; `fail` is told what stops it until its next motion."""
-        jobs.submit(LANE, partial(self._loop, jobs, fail))
+    def begin(
+        self,
+        jobs: Jobs,
+        fail: Callable[[Exception], None],
+        turn: Callable[[], AbstractContextManager[None]] = nullcontext,
+    ) -> None:
+        """Move the arm until the jobs are closed.
+
+        Args:
+            jobs: what moves it, beside the server's event loop.
+            fail: told what stops it until its next motion.
+            turn: makes what each move waits for, and is within.
+        """
+        jobs.submit(LANE, partial(self._loop, jobs, fail, turn))
 
     def play(self, playing: bool, speed: float, *, replays: bool) -> None:
         """Choose whether and how fast the robot moves, and whether its motion is shown in its place.
@@ -273,21 +285,24 @@ class Playback:
         if q is not None and (self._playing or q is not before):
             self.recording.add(seconds, q, q if without is None else without, live.arrived, seeks=live.left < 1)
 
-    def _loop(self, jobs: Jobs, fail: Callable[[Exception], None]) -> None:
+    def _loop(
+        self, jobs: Jobs, fail: Callable[[Exception], None], turn: Callable[[], AbstractContextManager[None]]
+    ) -> None:
         period = self._settings.shortest
         before = time.monotonic()
         while True:
             jobs.rest(LANE, max(0.0, before + period - time.monotonic()))
             if jobs.superseded(LANE):
                 return
-            now, waits = time.monotonic(), self._waits
-            try:
-                self.advance(0.0 if waits else now - before)
-            except Exception as error:
-                logger.exception("the arm stopped")
-                self.live.stop()
-                fail(error)
-            before, period = now, self._settings.asleep if waits else self._period(time.monotonic() - now)
+            with turn():
+                now, waits = time.monotonic(), self._waits
+                try:
+                    self.advance(0.0 if waits else now - before)
+                except Exception as error:
+                    logger.exception("the arm stopped")
+                    self.live.stop()
+                    fail(error)
+                before, period = now, self._settings.asleep if waits else self._period(time.monotonic() - now)
 
     def _period(self, taken: float) -> float:
         """Time from one picture to the next where moving and drawing takes so long, seconds."""

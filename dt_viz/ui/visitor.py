@@ -29,7 +29,7 @@ from dt_viz.scenario.tasks import TASKS, Task
 from dt_viz.serving.board import Share
 from dt_viz.session.arms import ArmStore
 from dt_viz.session.comparison import OTHERS
-from dt_viz.session.engine import Engine
+from dt_viz.session.engine import Engine, between_hands
 from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.opening import Preview
 from dt_viz.session.progress import Display, Pace, Progress
@@ -170,7 +170,7 @@ class Visitor(Display):
         self._panel.tour.begin(self.session)
         self.ruler = Ruler()
         """What the visitor's window is measured with."""
-        self.robot.playback.begin(self.session.jobs, self.session.fail)
+        self.robot.playback.begin(self.session.jobs, self.session.fail, between_hands)
         keep_ready(self)
 
     def measure(self) -> None:
@@ -327,7 +327,7 @@ class Visitor(Display):
             self.robot.adopt(self.session.scenario.view, self.pictures.look)
             self.robot.set_aside(self._previews is not False)
             self._panel.take(robot)
-        self.robot.playback.begin(self.session.jobs, self.session.fail)  # and the one before ends
+        self.robot.playback.begin(self.session.jobs, self.session.fail, between_hands)  # and the one before ends
         self._camera.reframe(arm_size=robot.size)
 
     @contextmanager

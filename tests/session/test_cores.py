@@ -344,3 +344,61 @@ def test_threads_take_short_turns_beside_what_computes_for_long_and_usual_ones_a
             raise UnwantedError
         assert sys.getswitchinterval() <= 0.001
     assert sys.getswitchinterval() == usual
+
+
+def moving_an_arm(cores, going_on):
+    """A thread that notes, within `between_hands`, that it goes on, and then waits until it may end."""
+    may_end = threading.Event()
+
+    def move():
+        with cores.between_hands():
+            going_on.set()
+            may_end.wait(PATIENCE)
+
+    thread = threading.Thread(target=move, daemon=True)
+    thread.start()
+    return thread, may_end
+
+
+def test_an_arm_moves_once_no_hand_is_followed_whatever_else_is_computed():
+    cores, moves = Cores(2, CoresSettings(pause=PATIENCE)), threading.Event()
+    with cores.slot(Rank.REFINEMENT):
+        with cores.slot():
+            thread, may_end = moving_an_arm(cores, moves)
+            assert not moves.wait(0.2)
+        assert moves.wait(PATIENCE / 3)
+    may_end.set()
+    thread.join(PATIENCE)
+
+
+def test_arms_move_one_after_the_other():
+    cores, first, second = Cores(2, CoresSettings(longest=PATIENCE)), threading.Event(), threading.Event()
+    one, one_may_end = moving_an_arm(cores, first)
+    assert first.wait(PATIENCE)
+    other, other_may_end = moving_an_arm(cores, second)
+    assert not second.wait(0.2)
+    one_may_end.set()
+    assert second.wait(PATIENCE / 3)
+    other_may_end.set()
+    for thread in (one, other):
+        thread.join(PATIENCE)
+
+
+def test_an_arm_moves_after_a_while_though_a_hand_is_followed_and_another_arm_is_held_up():
+    cores, first, second = Cores(2, CoresSettings(longest=0.6, pause=0.1)), threading.Event(), threading.Event()
+    with cores.slot():
+        one, one_may_end = moving_an_arm(cores, first)
+        assert first.wait(PATIENCE)
+        other, other_may_end = moving_an_arm(cores, second)
+        assert second.wait(PATIENCE)
+        other_may_end.set()
+        other.join(PATIENCE)
+    third = threading.Event()
+    last, last_may_end = moving_an_arm(cores, third)
+    assert not third.wait(0.3)  # the one that did not wait has let go of nothing that the first one holds
+    assert third.wait(PATIENCE)
+    for thread, may_end in ((one, one_may_end), (last, last_may_end)):
+        may_end.set()
+        thread.join(PATIENCE)
+    with cores.between_hands(), pytest.raises(ZeroDivisionError), cores.between_hands():
+        raise ZeroDivisionError

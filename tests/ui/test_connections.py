@@ -5,10 +5,11 @@ import functools
 import logging
 import os
 import socket
+import threading
 import time
 import urllib.error
 import urllib.request
-from contextlib import AsyncExitStack, asynccontextmanager, closing, nullcontext
+from contextlib import AsyncExitStack, asynccontextmanager, closing, contextmanager, nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import get_type_hints
@@ -27,6 +28,7 @@ from dt_viz.evaluate.protocol_client import OBSTACLE, ROLLOUT, LostError, Protoc
 from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.serving.listening import listen
+from dt_viz.session.cores import Cores
 from dt_viz.session.progress import Pace
 from dt_viz.ui import gate, keeping
 from dt_viz.ui import server as server_module
@@ -347,6 +349,39 @@ async def test_the_arm_of_a_page_that_nobody_touches_rests_and_soon_where_many_a
         assert await answers(idle)
         server.attend()
         assert not any(visitor.robot.playback.neglected for visitor in server.visitors)
+
+
+@asynchronous
+async def test_the_arm_of_a_page_moves_only_between_hands(url, server, monkeypatch):
+    """Also one that takes another's place."""
+    may_move, between_hands, asked = threading.Event(), Cores.between_hands, []
+    may_move.set()
+
+    @contextmanager
+    def counted(cores):
+        asked.append(True)
+        with between_hands(cores):
+            may_move.wait(PATIENCE)
+            yield
+
+    monkeypatch.setattr(Cores, "between_hands", counted)
+    async with Client(url) as client:
+        await client.look()
+        assert await client.wait_for(lambda: client.has_picture, PATIENCE)
+        (visitor,) = server.visitors
+        for _ in range(2):
+            robot, before = visitor.robot, len(asked)
+            moments = lambda: robot.playback.recording.past.times[-1]  # noqa: B023, E731
+            await asyncio.to_thread(wait_until, lambda: len(asked) > before + 5, PATIENCE)  # noqa: B023
+            await asyncio.to_thread(wait_until, lambda: robot.playback.recording.past is not None, PATIENCE)  # noqa: B023
+            may_move.clear()
+            await asyncio.sleep(0.3)
+            held = moments()
+            await asyncio.sleep(0.5)
+            assert moments() == held
+            may_move.set()
+            await asyncio.to_thread(wait_until, lambda: moments() > held, PATIENCE)  # noqa: B023
+            await asyncio.to_thread(visitor._exchange, "")
 
 
 @asynchronous

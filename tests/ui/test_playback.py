@@ -2,11 +2,12 @@
 
 import threading
 import time
+from contextlib import contextmanager
 from typing import Any, cast
 
 import numpy as np
 import pytest
-from pages import PATIENCE
+from pages import PATIENCE, wait_until
 
 from dt_viz.motion.following import ArmMotion
 from dt_viz.session.jobs import Jobs
@@ -125,6 +126,36 @@ def test_nothing_moves_before_it_begins():
     playback.begin(jobs, unexpected)
     assert drawn.wait(PATIENCE)
     jobs.close()
+
+
+def test_each_picture_waits_for_its_turn_and_what_fails_in_it_gives_it_back():
+    arm: Any = Arm()
+    may, drawn, said, given_back = threading.Semaphore(0), threading.Semaphore(0), [], []
+
+    @contextmanager
+    def turn():
+        may.acquire(timeout=PATIENCE)
+        yield
+        given_back.append(True)
+
+    def draw():
+        drawn.release()
+        if len(arm.asked) == 2:
+            raise ValueError("no way")
+
+    arm.stop = lambda: None
+    playback, jobs = Playback(cast(Any, arm), draw, FAST), Jobs(unexpected)
+    playback.begin(jobs, said.append, turn)
+    for number in range(1, 4):
+        assert not drawn.acquire(timeout=0.1)
+        assert len(given_back) == number - 1
+        may.release()
+        assert drawn.acquire(timeout=PATIENCE)
+        wait_until(lambda: len(given_back) == number)  # noqa: B023
+    assert [str(error) for error in said] == ["no way"]
+    jobs.close()
+    may.release()
+    assert jobs.wait_idle(timeout=PATIENCE)
 
 
 def test_the_longer_a_picture_takes_the_fewer_there_are():
