@@ -21,6 +21,8 @@ from dt_viz.session.robot_loop import LiveArm, RoundSettings
 
 logger = logging.getLogger(__name__)
 
+Turn = Callable[[], AbstractContextManager[None]]
+
 LANE = "arm"
 """Lane of the jobs on which the arm moves."""
 ALIKE = 1e-6
@@ -216,18 +218,10 @@ class Playback:
         playing, speed = (self._playing, self._speed) if player is None else (player.playing, player.speed)
         return speed if playing else 0.0
 
-    def begin(
-        self,
-        jobs: Jobs,
-        fail: Callable[[Exception], None],
-        turn: Callable[[], AbstractContextManager[None]] = nullcontext,
-    ) -> None:
-        """Move the arm until the jobs are closed.
+    def begin(self, jobs: Jobs, fail: Callable[[Exception], None], turn: Turn = nullcontext) -> None:
+        """Move the arm until the jobs are closed, each time within a `turn` that it waits for.
 
-        Args:
-            jobs: what moves it, beside the server's event loop.
-            fail: told what stops it until its next motion.
-            turn: makes what each move waits for, and is within.
+        `fail` is told what stops it until its next motion.
         """
         jobs.submit(LANE, partial(self._loop, jobs, fail, turn))
 
@@ -285,9 +279,7 @@ class Playback:
         if q is not None and (self._playing or q is not before):
             self.recording.add(seconds, q, q if without is None else without, live.arrived, seeks=live.left < 1)
 
-    def _loop(
-        self, jobs: Jobs, fail: Callable[[Exception], None], turn: Callable[[], AbstractContextManager[None]]
-    ) -> None:
+    def _loop(self, jobs: Jobs, fail: Callable[[Exception], None], turn: Turn) -> None:
         period = self._settings.shortest
         before = time.monotonic()
         while True:
