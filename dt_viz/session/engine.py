@@ -131,6 +131,7 @@ class Engine:
         progress: Progress | None = None,
         cancelled: Cancelled = never,
         newest: Callable[[Scenario], Scenario] = lambda scenario: scenario,
+        draw: Callable[[Frame], None] = lambda frame: None,
     ) -> Iterator[Frame]:
         """Frames for a scenario, one for each stage; stop iterating to skip what is not wanted any more.
 
@@ -139,6 +140,8 @@ class Engine:
             progress: told how far learning is; see `dt_viz.learning.imitation.fit`.
             cancelled: asked after stage LIVE, before each part of the computation and while it waits for a slot.
             newest: asked, once there is a slot, for the scenario to compute: it, or one with another stack.
+            draw: called with frames of stages ROLLOUTS and LIVE before they come, in the slot that they were computed
+                in: what a hand waits for is computed and drawn in one go. It takes no other slot.
 
         Raises:
             DemonstrationError: the task's demonstrations cannot be read.
@@ -161,9 +164,11 @@ class Engine:
         with _cores.slot(rank):
             scenario = newest(scenario)
             frame = self._rollouts(scenario, LIVE)
+            draw(frame)
         yield frame
         with _cores.slot(rank):
             frame = self._seen(frame, Stage.LIVE, learned)
+            draw(frame)
         yield frame
         frame = self._fine(scenario, learned, cancelled)
         yield frame

@@ -426,7 +426,7 @@ class Session:
     def _show_frames(self, scenario: Scenario, edited: float, superseded: Callable[[], bool]) -> None:
         self._catch_up()
         learn = partial(self._learn, scenario)
-        engine, begun = self.engines(scenario.arm, learn), edited
+        engine, begun, pause = self.engines(scenario.arm, learn), edited, 0.0
 
         def newest(before: Scenario) -> Scenario:
             """Where somebody drags and others compute, the place in the queue is the same for the newest scenario."""
@@ -439,20 +439,24 @@ class Session:
                 self._edits.num_skipped += self.jobs.drop(LANE)
             return self._decided(newest)
 
-        for frame in engine.frames(scenario, learn, superseded, newest):
+        def draw(frame: Frame) -> None:
+            nonlocal pause
             drawn = self._shown is not None and frame.scenario.choices == self._shown.scenario.choices
-            self._shown = frame
+            self._shown, pause = frame, 0.0
             if frame.stage is Stage.ROLLOUTS and drawn:
-                continue  # it is only looked at in another way: the next stage is what changes
+                return  # it is only looked at in another way: the next stage is what changes
             self._screen.draw(frame, edited, self._edits.num_skipped, self._edits.number)
             if frame.stage in (Stage.ROLLOUTS, Stage.FINE):
                 engine.drive(frame)
-            if frame.stage is Stage.LIVE:
-                self.jobs.rest(LANE, REST)
-            elif frame.stage is Stage.ROLLOUTS:
+            if frame.stage is Stage.ROLLOUTS:
                 pause = self._screen.live_pause(time.perf_counter() - begun)
-                if pause <= 0:
-                    continue  # the field is due, whatever is waiting
-                self.jobs.rest(LANE, pause)
+
+        for frame in engine.frames(scenario, learn, superseded, newest, draw=draw):
+            if frame.stage is Stage.ROLLOUTS and pause <= 0:
+                continue  # the field is due, whatever is waiting
+            if frame.stage > Stage.LIVE:
+                draw(frame)
+            else:
+                self.jobs.rest(LANE, REST if frame.stage is Stage.LIVE else pause)
             if superseded():
                 return

@@ -88,19 +88,23 @@ class Recorder(Display):
 
 
 def _timed(engine: Engine, shown: Recorder) -> Engine:
-    """Return an engine that tells the recorder how long it computes."""
+    """Return an engine that tells the recorder how long it computes what follows a hand, without what draws it."""
     frames = engine.frames
 
-    def timed(*scenario: Any, **others: Any) -> Iterator[Frame]:
-        computing, spent = frames(*scenario, **others), 0.0
-        while True:
-            began = time.perf_counter()
-            frame = next(computing, None)
-            spent += time.perf_counter() - began
-            if frame is None:
-                return
-            shown.seconds = spent  # without what is done with the frames
+    def timed(*scenario: Any, draw: Callable[[Frame], None] = lambda frame: None, **others: Any) -> Iterator[Frame]:
+        began = time.perf_counter()
+
+        def draw_timed(frame: Frame) -> None:
+            nonlocal began
+            now = time.perf_counter()
+            shown.seconds = now - began
+            draw(frame)
+            began += time.perf_counter() - now
+
+        for frame in frames(*scenario, draw=draw_timed, **others):
+            now = time.perf_counter()
             yield frame
+            began += time.perf_counter() - now
 
     engine.frames = timed
     return engine

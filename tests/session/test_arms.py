@@ -59,8 +59,12 @@ class Sketches(NoFrames):
     def drive(self, frame):
         pass
 
-    def frames(self, *what):
-        return (Sketch(what[0], stage) for stage in Stage)
+    def frames(self, *what, draw):
+        for stage in Stage:
+            frame = Sketch(what[0], stage)
+            if stage <= Stage.LIVE:
+                draw(frame)
+            yield frame
 
 
 class Display:

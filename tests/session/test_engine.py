@@ -329,6 +329,20 @@ def test_the_first_picture_of_a_task_takes_no_slot_of_a_hand(new_engine, initial
     assert taken == [rank, rank]
 
 
+def test_what_follows_a_hand_is_drawn_in_the_slot_it_was_computed_in(new_engine, initial, monkeypatch):
+    cores, drawn, held = Cores(2), [], []
+    monkeypatch.setattr(engine_module, "_cores", cores)
+
+    def draw(frame):
+        drawn.append(frame)
+        held.append(len(cores._held))
+
+    frames = new_engine().frames(initial("draw_s"), draw=draw)
+    assert [(next(frames), len(cores._held)) for _ in range(2)] == [(frame, 0) for frame in drawn]
+    assert [frame.stage for frame in drawn] == [Stage.ROLLOUTS, Stage.LIVE] and held == [1, 1]
+    frames.close()
+
+
 def test_what_refines_ends_between_its_parts_when_it_is_not_wanted_any_more(new_engine, initial):
     asked = []
 

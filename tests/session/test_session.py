@@ -14,7 +14,7 @@ from scenes import avoiding, biases, changed, changing
 from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.avoidance.passing import ANEW, Passing
 from dt_viz.avoidance.registry import AVOIDANCE
-from dt_viz.errors import end_if, never
+from dt_viz.errors import end_if
 from dt_viz.learning.demonstrations import DemonstrationError
 from dt_viz.learning.imitation import ImitationError
 from dt_viz.obstacles.shapes import Box, Sphere
@@ -59,7 +59,7 @@ class FakeEngine:
     def title(self, name):
         return name
 
-    def frames(self, scenario, progress=None, cancelled=never, newest=lambda scenario: scenario):
+    def frames(self, scenario, progress, cancelled, newest, *, draw):
         self.begun.set()
         if self.queue is not None:
             assert self.queue.wait(PATIENCE)
@@ -83,7 +83,10 @@ class FakeEngine:
                 time.sleep(0.001)
             if stage is Stage.LIVE and scenario.view.generator_layer == -9:
                 raise IndexError("no such flow")
-            yield Sketch(scenario, stage)
+            frame = Sketch(scenario, stage)
+            if stage <= Stage.LIVE:
+                draw(frame)
+            yield frame
 
     def see(self, scenario):
         self.seen.append(scenario)
