@@ -12,7 +12,7 @@ from weakref import WeakValueDictionary
 
 @dataclass(frozen=True)
 class QuotaSettings:
-    """Quotas of processor time, of one process; a visitor who drags uses about a third of a second a second."""
+    """Quotas of processor time, of one process; a visitor who drags alone uses up to 0.8 s a second."""
 
     rate: float = 0.4
     """Processor time that a visitor is given, seconds a second."""

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.linalg import solveh_banded
 from scipy.spatial.transform import Slerp
 
+from dt_viz.checkpoints import checkpoint
 from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.flows.rotations import quaternions, rotation
 from dt_viz.learning.demonstrations import Demonstration
@@ -183,6 +184,7 @@ def repair(takes: Sequence[Repaired], settings: PreparationSettings) -> None:
     """Look for other units, outliers, gaps, jitter and pauses, in this order, and repair them."""
     _find_units(takes, settings)
     for take in takes:
+        checkpoint()
         _find_outliers(take, settings)
         _smooth(take, settings)
     _find_pauses(takes, settings)

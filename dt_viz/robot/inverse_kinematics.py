@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dt_viz.checkpoints import checkpoint
 from dt_viz.flows.fields import Array
 from dt_viz.flows.rotations import apart, rotation
 from dt_viz.kernels.tracking import Postures, settle, walk
@@ -86,6 +87,7 @@ def arriving(
 
     Arguments and errors are those of that.
     """
+    checkpoint()
     settings, target = robot.sized_tracking, np.asarray(target, dtype=float)
     ahead, left = np.array(robot.front), np.array([-robot.front[1], robot.front[0], 0.0])
     azimuth = np.arctan2(left @ target, ahead @ target)  # 0 ahead of the base
@@ -291,6 +293,7 @@ def _references(robot: Robot, reference: ArrayLike, shape: tuple[int, ...]) -> A
 
 def _walk(robot: Robot, paths: Array, starts: Array, posture: Postures, stride: float) -> Array:
     """Walk along targets (B, T, 3 or 12), all at once, one stride after the other; return rough joints (B, T, n)."""
+    checkpoint()
     begin = robot.end_effector(starts)
     if paths.shape[-1] > 3:
         begin = targets_of(robot, begin, robot.hand_orientation(starts))

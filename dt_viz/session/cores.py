@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import itertools
+import math
 import os
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -28,6 +30,10 @@ class CoresSettings:
     """Interval at which what waits and may be cancelled asks whether it is still wanted, unless it is woken before."""
     longest: float = 0.25
     """Longest time for which who has overdrawn, refines or moves an arm gives way at once: he goes on, if slowly."""
+    gap: float = 0.15
+    """Longest time between two frames of a drag during which who has overdrawn gives way, too."""
+    least: float = 0.05
+    """Shortest time that who has overdrawn computes from one pause to the next."""
     pause: float = 0.05
     """Longest time for which an arm whose turn it is to be moved waits while a hand is followed."""
     turn: float = 0.0005
@@ -42,6 +48,14 @@ class Rank(IntEnum):
     BEGINNING = 1
     """The first picture of a page, a task or a scene: takes ten times as long."""
     REFINEMENT = 2
+
+
+class _Thread(threading.local):
+    went_on: float = -math.inf
+    """When it last went on after it had given way, of `time.monotonic`."""
+
+
+_thread = _Thread()
 
 
 class _Place(NamedTuple):
@@ -60,9 +74,9 @@ class Cores:
     """A bounded semaphore with priorities.
 
     Slots are given by rank; among equals who owes least comes first, and of these who has waited longest. One slot is
-    for hands only, unless there is only one: a hand waits for other hands alone. At each checkpoint a refinement ends
-    if it is cancelled, and pauses while another slot follows a hand: they would share a processor. Nobody waits for a
-    slot within a slot, nor within a `functools.cached_property`: Python 3.10 and 3.11 lock it for all instances.
+    for hands only, unless there is only one: a hand waits for other hands alone. At checkpoints what follows no hand
+    gives way, see `give_way`, and a refinement ends if it is cancelled. Nobody waits for a slot within a slot, nor
+    within a `functools.cached_property`: Python 3.10 and 3.11 lock it for all instances.
     """
 
     def __init__(self, num: int = os.cpu_count() or 1, settings: CoresSettings = CoresSettings()) -> None:
@@ -77,6 +91,8 @@ class Cores:
         """Those who wait; the smallest is next."""
         self._held: list[_Place] = []
         """Those who have a slot."""
+        self._followed = -math.inf
+        """When a slot that followed a hand was last given back, of `time.monotonic`."""
         self._between = threading.Lock()
         """Held by one of those within `between_hands`."""
         self._num_long, self._usual_turn = 0, sys.getswitchinterval()
@@ -104,12 +120,15 @@ class Cores:
                 place.woken.wait(None if rank is Rank.HAND else self._settings.look)
                 place.woken.clear()
                 end_if(cancelled)
-            with checked(partial(self._let_hands_go_first, cancelled) if rank is Rank.REFINEMENT else never):
+            refines = rank is Rank.REFINEMENT
+            with checked(never if rank is Rank.HAND else partial(self.give_way, cancelled, refines=refines)):
                 yield
         finally:
             settle()
             with self._lock:
                 (self._held if place in self._held else self.queue).remove(place)
+                if rank is Rank.HAND:
+                    self._followed = time.monotonic()
                 self._admit()
                 self._left.notify_all()
 
@@ -120,21 +139,28 @@ class Cores:
                 if place.thread == thread and place.rank is not Rank.HAND:
                     place.woken.set()
 
-    def give_way(self) -> None:
-        """Pause for a while if this thread's account is overdrawn and others compute, or wait, who owe less.
+    def give_way(self, cancelled: Cancelled = never, *, refines: bool = False) -> None:
+        """Pause for a while at most: what refines, while another slot follows a hand: they would share a processor.
 
-        Within a slot or not: what holds none, such as learning, gives way all the same.
+        Who has overdrawn pauses, within a slot or not, between two frames of another one's drag, too, and while a slot
+        is had by who owes less. What waits for a slot is no reason: with a single one it may wait for this.
+
+        Raises:
+            UnwantedError: it is cancelled.
         """
-        debt, own = settle(), threading.get_ident()
-        if not debt:
-            return
+        debt, own, now = settle(), threading.get_ident(), time.monotonic()
+        pauses = refines or (debt and now - _thread.went_on > self._settings.least)
+        longest = now + self._settings.longest if pauses else now
         with self._left:
-
-            def is_last() -> bool:
-                others = [place for place in (*self._held, *self.queue) if place.thread != own]
-                return all(place.debt >= debt for place in others)
-
-            self._left.wait_for(is_last, self._settings.longest)
+            while now < longest and not cancelled():
+                others = [place for place in self._held if place.thread != own]
+                come_first = any(place.rank is Rank.HAND or place.debt < debt for place in others)
+                until = longest if come_first else min(longest, self._followed + self._settings.gap if debt else now)
+                if until <= now:
+                    break
+                self._left.wait(until - now)
+                now = _thread.went_on = time.monotonic()
+        end_if(cancelled)
 
     @contextmanager
     def between_hands(self) -> Iterator[None]:
@@ -147,7 +173,8 @@ class Cores:
         try:
             with self._left:
                 self._left.wait_for(self._no_hand_is_followed, self._settings.pause)
-            yield
+            with checked(never):
+                yield
         finally:
             if alone:
                 self._between.release()
@@ -172,26 +199,8 @@ class Cores:
                 if not self._num_long:
                     sys.setswitchinterval(self._usual_turn)
 
-    def _let_hands_go_first(self, cancelled: Cancelled) -> None:
-        """Pause for a while if another slot follows a hand. Raises UnwantedError if it is cancelled.
-
-        A hand that waits is no reason: with a single slot it waits for this refinement.
-        """
-        with self._left:
-            self._left.wait_for(lambda: cancelled() or self._no_hand_is_followed(), self._settings.longest)
-        end_if(cancelled)
-
     def _no_hand_is_followed(self) -> bool:
         return all(place.rank is not Rank.HAND for place in self._held)
-
-    def giving_way(self, cancelled: Cancelled) -> Cancelled:
-        """Return the same question, which gives way whenever it is asked: between parts of what takes long."""
-
-        def asked() -> bool:
-            self.give_way()
-            return cancelled()
-
-        return asked
 
     def _admit(self) -> None:
         """Give slots to those who are next, as far as there are any; nothing refines while a hand waits."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from dt_viz.avoidance.avoidance import Avoidance
 from dt_viz.avoidance.passing import ANEW
+from dt_viz.checkpoints import checkpoint
 from dt_viz.errors import Cancelled, never
 from dt_viz.learning.augmented import AugmentedImitation
 from dt_viz.learning.imitation import Progress
@@ -53,6 +54,11 @@ _cores = Cores()
 def wake(thread: int) -> None:
     """Have what waits for a slot on a thread ask whether it is still wanted."""
     _cores.wake(thread)
+
+
+def give_way() -> None:
+    """Pause if this thread's account is overdrawn and others come first; see `Cores.give_way`."""
+    _cores.give_way()
 
 
 def between_hands() -> AbstractContextManager[None]:
@@ -151,7 +157,7 @@ class Engine:
         steps = list[str]()
 
         def learn(fraction: float, message: str) -> None:
-            _cores.give_way()
+            checkpoint()
             steps.append(message)
             if progress is not None:
                 progress(fraction, message)
@@ -385,7 +391,12 @@ class Engine:
         """The last frame again and again, each with more of what is known of other methods."""
         if not frame.scenario.view.compared:
             return
-        left = self.comparison.complete(frame, self._plain(frame.scenario), _cores.giving_way(cancelled))
+
+        def asked() -> bool:
+            checkpoint()
+            return cancelled()
+
+        left = self.comparison.complete(frame, self._plain(frame.scenario), asked)
         while True:
             with _cores.slot(Rank.REFINEMENT, cancelled):
                 notes = next(left, None)

@@ -8,7 +8,8 @@ from collections import deque
 from collections.abc import Callable
 
 from dt_viz.accounts import Account, charged
-from dt_viz.errors import UnwantedError
+from dt_viz.checkpoints import checked
+from dt_viz.errors import UnwantedError, never
 
 logger = logging.getLogger(__name__)
 
@@ -28,13 +29,14 @@ class Jobs:
         fail: Callable[[Exception], None],
         account: Account | None = None,
         wake: Callable[[int], None] = lambda _thread: None,
+        give_way: Callable[[], object] = never,
     ) -> None:
         """Wait for work; `fail` is told of the exceptions that it raises, unless the visitor has left.
 
         Its processor time is charged to the visitor's `account`, if there is one; `wake` is told the number of a thread
-        whose work is superseded.
+        whose work is superseded; `give_way` is called at each checkpoint of work, and may pause.
         """
-        self._fail, self._account, self._wake = fail, account, wake
+        self._fail, self._account, self._wake, self._give_way = fail, account, wake, give_way
         self._lock = threading.Lock()
         self._news: dict[str, threading.Condition] = {}
         """Notified of new work, for each lane that has rested: what is news for one lane wakes no other one."""
@@ -127,7 +129,7 @@ class Jobs:
                     return
                 work = waiting.popleft()
             try:
-                with charged(self._account):
+                with charged(self._account), checked(self._give_way):
                     work()
             except UnwantedError:
                 pass

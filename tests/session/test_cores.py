@@ -8,7 +8,7 @@ from time import monotonic, thread_time
 import pytest
 
 from dt_viz.accounts import Account, QuotaSettings, charged
-from dt_viz.checkpoints import checkpoint
+from dt_viz.checkpoints import checked, checkpoint
 from dt_viz.errors import UnwantedError, never
 from dt_viz.session.cores import Cores, CoresSettings, Rank
 
@@ -191,15 +191,16 @@ def test_what_is_computed_in_a_slot_is_charged(crowd):
         assert 0.1 <= account.debt < 0.2
 
 
+@pytest.mark.parametrize("begins", [True, False], ids=["within a slot", "without"])
 @pytest.mark.parametrize("account", [None, owing(5.0)], ids=["in credit", "overdrawn"])
 @pytest.mark.parametrize("followed", [True, False])
-def test_between_parts_who_has_overdrawn_gives_way_while_a_hand_is_followed(account, followed):
+def test_at_a_checkpoint_who_has_overdrawn_gives_way_while_a_hand_is_followed(account, followed, begins):
     gives_way = followed and account is not None
     cores, went_on = Cores(2, CoresSettings(longest=0.5 if gives_way else 10 * PATIENCE)), threading.Event()
 
     def compute():
-        with charged(account), cores.slot(Rank.REFINEMENT):
-            assert not cores.giving_way(never)()
+        with charged(account), cores.slot(Rank.BEGINNING) if begins else checked(cores.give_way):
+            checkpoint()
             went_on.set()
 
     thread, began = threading.Thread(target=compute), monotonic()
@@ -210,8 +211,9 @@ def test_between_parts_who_has_overdrawn_gives_way_while_a_hand_is_followed(acco
     thread.join(PATIENCE)
 
 
-def test_who_has_overdrawn_goes_on_as_soon_as_no_hand_is_followed():
-    cores, went_on = Cores(2, CoresSettings(longest=PATIENCE)), threading.Event()
+@pytest.mark.parametrize("gap", [0.0, 0.4])
+def test_who_has_overdrawn_goes_on_once_a_drag_has_ended(gap):
+    cores, went_on = Cores(2, CoresSettings(longest=10 * PATIENCE, gap=gap)), threading.Event()
 
     def compute():
         with charged(owing(5.0)):
@@ -222,8 +224,59 @@ def test_who_has_overdrawn_goes_on_as_soon_as_no_hand_is_followed():
     with cores.slot():
         thread.start()
         assert not went_on.wait(0.2)
+    ended = monotonic()
     assert went_on.wait(PATIENCE / 3)
+    assert monotonic() - ended >= gap - 0.05
     thread.join(PATIENCE)
+
+
+@pytest.mark.parametrize("owed", [1.0, 9.0])
+def test_who_has_overdrawn_gives_way_to_who_owes_less_and_computes(owed):
+    cores, went_on, has_slot, end = Cores(2, CoresSettings(longest=10 * PATIENCE)), *(threading.Event() for _ in "abc")
+
+    def refine():
+        with charged(owing(owed)), cores.slot(Rank.REFINEMENT):
+            has_slot.set()
+            end.wait(PATIENCE)
+
+    def compute():
+        with charged(owing(5.0)):
+            cores.give_way()
+            went_on.set()
+
+    threads = [threading.Thread(target=work) for work in (refine, compute)]
+    threads[0].start()
+    assert has_slot.wait(PATIENCE)
+    threads[1].start()
+    assert went_on.wait(0.3 if owed < 5 else PATIENCE) == (owed > 5)
+    end.set()
+    assert went_on.wait(PATIENCE)
+    for thread in threads:
+        thread.join(PATIENCE)
+
+
+@pytest.mark.parametrize(("least", "pauses"), [(PATIENCE, False), (0.0, True)])
+def test_who_has_overdrawn_computes_for_a_while_between_two_pauses(least, pauses):
+    cores, ended = Cores(2, CoresSettings(longest=0.5, least=least)), threading.Event()
+
+    def compute():
+        with charged(owing(5.0)), checked(cores.give_way):
+            for _ in range(5):
+                checkpoint()
+        ended.set()
+
+    thread, began = threading.Thread(target=compute), monotonic()
+    with cores.slot():
+        thread.start()
+        assert ended.wait(PATIENCE)
+    assert monotonic() - began >= 0.5 and (monotonic() - began >= 2.5) == pauses
+    thread.join(PATIENCE)
+
+
+def test_an_arm_that_moves_gives_no_way_at_checkpoints():
+    cores = Cores(2)
+    with checked(lambda: pytest.fail("an arm paused")), cores.between_hands():
+        checkpoint()
 
 
 def test_a_slot_ends_with_an_exception(crowd):

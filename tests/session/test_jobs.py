@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from dt_viz.accounts import Account, QuotaSettings
+from dt_viz.checkpoints import checkpoint
 from dt_viz.errors import UnwantedError
 from dt_viz.session.jobs import Jobs
 
@@ -29,6 +30,21 @@ def test_what_all_lanes_use_is_charged_to_the_visitor():
         jobs.submit(lane, compute)
     assert jobs.wait_idle(timeout=PATIENCE) and not errors
     assert 0.2 <= account.debt < 0.3
+
+
+def test_work_gives_way_at_its_checkpoints():
+    paused, done = [], []
+    jobs = Jobs(lambda error: pytest.fail(str(error)), give_way=lambda: paused.append(len(done)))
+
+    def compute():
+        for part in range(3):
+            checkpoint()
+            done.append(part)
+
+    jobs.submit(LANE, compute)
+    assert jobs.wait_idle(timeout=PATIENCE) and paused == [0, 1, 2]
+    checkpoint()
+    assert len(paused) == 3
 
 
 class Gate:

@@ -14,6 +14,7 @@ from scenes import avoiding, biases, changed, changing
 from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.avoidance.passing import ANEW, Passing
 from dt_viz.avoidance.registry import AVOIDANCE
+from dt_viz.checkpoints import checkpoint
 from dt_viz.errors import end_if
 from dt_viz.learning.demonstrations import DemonstrationError
 from dt_viz.learning.imitation import ImitationError
@@ -23,6 +24,7 @@ from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.slices import SlicePose
 from dt_viz.scenario.stack import IMITATION, with_added, without
 from dt_viz.scenario.tasks import TASKS
+from dt_viz.session import engine as engine_module
 from dt_viz.session import session as session_module
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Stage
@@ -495,6 +497,14 @@ def test_a_session_that_closes_ends_what_it_computes_for_a_hand(opened, stage):
     opened.session.close()
     assert opened.session.jobs.wait_idle(timeout=PATIENCE)
     assert opened.page.errors == []
+
+
+def test_all_work_of_a_visitor_gives_way_to_others_at_its_checkpoints(opened, monkeypatch):
+    paused = []
+    monkeypatch.setattr(engine_module._cores, "give_way", lambda: paused.append(threading.current_thread().name))
+    opened.session.jobs.submit("reading", checkpoint)
+    assert opened.session.jobs.wait_idle(timeout=PATIENCE)
+    assert paused == ["reading"]
 
 
 def test_edits_during_a_computation_are_overtaken_by_the_last(opened):
