@@ -37,8 +37,10 @@ class SupervisorSettings:
     """Time for which a connection that was handed over counts, as it may not be on the board yet."""
     hesitation: float = 1.0
     """Time without a beat after which a process gets connections only if all others hesitate, too."""
-    silence: float = 10.0
-    """Time without a beat after which a process counts as stuck: compiling holds it up for some."""
+    silence: float = 2.0
+    """Time without a beat after which a process counts as stuck."""
+    beginning: float = 10.0
+    """Time that a process has for its first beat."""
     patience: float = 2.5
     """Time that processes have to end before they are killed."""
     restart: float = 0.5
@@ -108,6 +110,8 @@ class Supervisor:
         """Accepted connections that have not said yet what they want, and when they came."""
         self._selector = selectors.DefaultSelector()
         self._is_ready = False
+        self._looked = self._woke = time.monotonic()
+        """When it last looked after the processes, and when it began to after all of them may have stood still."""
 
     def run(self) -> int:
         """Serve until KeyboardInterrupt is raised, then end the processes.
@@ -183,7 +187,9 @@ class Supervisor:
         Returns:
             Exit status of a process that could not even begin, and would not the next time; 0 without any.
         """
-        now = time.monotonic()
+        before, self._looked = self._looked, (now := time.monotonic())
+        if now - before > self._settings.hesitation:
+            self._woke = now
         for connection in [one for one, came in self._asking.items() if now - came > self._settings.request]:
             self._forget(connection)
             connection.close()
@@ -199,13 +205,18 @@ class Supervisor:
                     worker.channel.close()
                     self._board.rows[number]["counts"]["restarts"] += 1
                     self._start(number)
-            elif now - self._board.rows[number]["beat"] > self._settings.silence:
+            elif self._is_silent(number, worker, now):
                 logger.warning("process %d does not answer: it is ended", worker.process.pid)
                 worker.process.kill()
             elif not self._is_ready and self._has_run(number, worker):
                 self._is_ready = True
                 self._ready()
         return 0
+
+    def _is_silent(self, number: int, worker: _Worker, now: float) -> bool:
+        """Return whether a process should have told long ago that it runs."""
+        longest = self._settings.silence if self._has_run(number, worker) else self._settings.beginning
+        return now - max(self._woke, float(self._board.rows[number]["beat"])) > longest
 
     def _has_run(self, number: int, worker: _Worker) -> bool:
         """Return whether the event loop of a process has run."""

@@ -4,6 +4,7 @@ import asyncio
 import os
 import signal
 import sys
+import time
 from contextlib import suppress
 
 from dt_viz.serving.board import Board, Share
@@ -21,6 +22,8 @@ def main(kind: str = "", silence: str = "10") -> int:
     def work(share: Share, listening: HandedOver) -> int:
         if kind == "fails":
             return 3
+        if kind == "slow":
+            time.sleep(3 * float(silence))
         if kind == "stubborn":
             signal.signal(signal.SIGTERM, signal.SIG_IGN)
         asyncio.run(serve(share, listening))

@@ -5,6 +5,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections import Counter
 from contextlib import closing, contextmanager, suppress
@@ -27,11 +28,14 @@ def serving(*arguments):
     """The process that accepts, and visits to it."""
     program = [sys.executable, str(SMALL), *arguments]
     with subprocess.Popen(program, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        patience = threading.Timer(4 * PATIENCE, process.kill)  # of who reads a line that never comes
+        patience.start()
         try:
             assert process.stdout is not None
             with closing(Visits(int(process.stdout.readline()))) as visits:
                 yield process, visits
         finally:
+            patience.cancel()
             process.terminate()
             process.wait(PATIENCE)
 
@@ -147,6 +151,25 @@ def test_a_process_that_does_not_answer_gets_nobody_and_is_replaced():
         wait_until(lambda: not is_alive(stuck))
         time.sleep(2 * RECENT)
         assert stuck not in visits.both()
+
+
+def test_a_process_that_begins_slowly_is_no_stuck_one():
+    with serving("slow", "0.5") as (_, visits):
+        assert all(map(is_alive, visits.both()))
+
+
+@pytest.mark.parametrize("stopped", [True, False])
+def test_where_all_stood_still_none_is_a_stuck_one(stopped):
+    """As where a machine, or a container, is suspended for a while."""
+    with serving("", "1.2") as (process, visits):
+        both = visits.both()
+        everyone = [*both, process.pid] if stopped else both
+        for signal_ in (signal.SIGSTOP, signal.SIGCONT):
+            for pid in reversed(everyone):  # at first who looks after the others
+                with suppress(ProcessLookupError):
+                    os.kill(pid, signal_)
+            time.sleep(2.0)
+        assert [is_alive(pid) for pid in both] == [stopped, stopped]
 
 
 def test_processes_that_cannot_begin_end_all_with_their_status():
