@@ -111,7 +111,7 @@ class Supervisor:
         self._selector = selectors.DefaultSelector()
         self._is_ready = False
         self._looked = self._woke = time.monotonic()
-        """When it last looked after the processes, and when it began to after all of them may have stood still."""
+        """Times of the last look at the processes, and of the first one after the machine was suspended, if it was."""
 
     def run(self) -> int:
         """Serve until KeyboardInterrupt is raised, then end the processes.
@@ -214,7 +214,7 @@ class Supervisor:
         return 0
 
     def _is_silent(self, number: int, worker: _Worker, now: float) -> bool:
-        """Return whether a process should have told long ago that it runs."""
+        """Return whether the last beat of a process is too long ago, time of a suspended machine not counted."""
         longest = self._settings.silence if self._has_run(number, worker) else self._settings.beginning
         return now - max(self._woke, float(self._board.rows[number]["beat"])) > longest
 

@@ -31,9 +31,9 @@ class CoresSettings:
     longest: float = 0.25
     """Longest time for which who has overdrawn, refines or moves an arm gives way at once: he goes on, if slowly."""
     gap: float = 0.15
-    """Longest time between two frames of a drag during which who has overdrawn gives way, too."""
+    """Time after a frame of a drag for which overdrawn accounts still give way: the next frame is about to begin."""
     least: float = 0.05
-    """Shortest time that who has overdrawn computes from one pause to the next."""
+    """Time that an overdrawn account computes, at least, from one pause to the next."""
     pause: float = 0.05
     """Longest time for which an arm whose turn it is to be moved waits while a hand is followed."""
     turn: float = 0.0005
@@ -140,10 +140,10 @@ class Cores:
                     place.woken.set()
 
     def give_way(self, cancelled: Cancelled = never, *, refines: bool = False) -> None:
-        """Pause for a while at most: what refines, while another slot follows a hand: they would share a processor.
+        """Pause where others come first, for `longest` at most; called at checkpoints, within a slot or not.
 
-        Who has overdrawn pauses, within a slot or not, between two frames of another one's drag, too, and while a slot
-        is had by who owes less. What waits for a slot is no reason: with a single one it may wait for this.
+        A refinement pauses while another slot follows a hand. A thread whose account is overdrawn also pauses between
+        the frames of a drag, and while an account that owes less has a slot.
 
         Raises:
             UnwantedError: it is cancelled.
@@ -172,7 +172,8 @@ class Cores:
         alone = self._between.acquire(timeout=self._settings.longest)
         try:
             with self._left:
-                self._left.wait_for(self._no_hand_is_followed, self._settings.pause)
+                no_hand = lambda: all(place.rank is not Rank.HAND for place in self._held)  # noqa: E731
+                self._left.wait_for(no_hand, self._settings.pause)
             with checked(never):
                 yield
         finally:
@@ -198,9 +199,6 @@ class Cores:
                 self._num_long -= 1
                 if not self._num_long:
                     sys.setswitchinterval(self._usual_turn)
-
-    def _no_hand_is_followed(self) -> bool:
-        return all(place.rank is not Rank.HAND for place in self._held)
 
     def _admit(self) -> None:
         """Give slots to those who are next, as far as there are any; nothing refines while a hand waits."""
