@@ -140,10 +140,12 @@ class Share:
 
     @contextmanager
     def next_place(self, num_places: int) -> Iterator[bool]:
-        """Yield whether who waits longest here has the next place; until it is told who takes it, no other may."""
+        """Yield whether there is a place for who waits longest here, beside those who came before him elsewhere.
+
+        Until it is told who takes it, no other may.
+        """
         with self._board.locked():
-            is_first = self._row["came"].min() <= self._board.rows["came"].min()
-            yield is_first and self.num_visitors < num_places
+            yield self.num_visitors + self.num_before(self._row["came"].min()) < num_places
 
     def num_connections(self, address: str | None = None) -> int:
         """Return the number of connections, in all processes, of an address or of all."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import os
 import sys
@@ -10,10 +9,9 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import partial
-from typing import NamedTuple
 
 from dt_viz.accounts import settle
 from dt_viz.checkpoints import checked
@@ -36,6 +34,8 @@ class CoresSettings:
     """Time that an overdrawn account computes, at least, from one pause to the next."""
     pause: float = 0.05
     """Longest time for which an arm whose turn it is to be moved waits while a hand is followed."""
+    patience: float = 1.0
+    """Longest time for which who has waited longest is passed over for those whose rank or debt is smaller."""
     turn: float = 0.0005
     """Time for which a thread keeps the interpreter while another one waits for it, beside `Cores.short_turns`."""
 
@@ -47,7 +47,9 @@ class Rank(IntEnum):
     """It follows a hand: takes a fraction of the time from one picture to the next."""
     BEGINNING = 1
     """The first picture of a page, a task or a scene: takes ten times as long."""
-    REFINEMENT = 2
+    PAGE = 2
+    """A part of a page that is built; it has no picture yet."""
+    REFINEMENT = 3
 
 
 class _Thread(threading.local):
@@ -58,25 +60,29 @@ class _Thread(threading.local):
 _thread = _Thread()
 
 
-class _Place(NamedTuple):
-    """A place in the queue; the smallest comes first."""
+@dataclass(order=True)
+class _Place:
+    """A place in the queue, or a slot; the smallest comes first."""
 
     rank: Rank
     debt: float
     """Debt of the account on arrival, seconds; 0 if it is not overdrawn."""
-    number: int
-    """A number that grows with each arrival."""
-    thread: int
-    woken: threading.Event
+    came: float
+    """Time of arrival, of `time.monotonic`."""
+    thread: int = field(default_factory=threading.get_ident)
+    woken: threading.Event = field(default_factory=threading.Event, compare=False)
+    pauses: bool = field(default=False, compare=False)
+    """Whether it gives way at a checkpoint."""
 
 
 class Cores:
     """A bounded semaphore with priorities.
 
-    Slots are given by rank; among equals who owes least comes first, and of these who has waited longest. One slot is
-    for hands only, unless there is only one: a hand waits for other hands alone. At checkpoints what follows no hand
-    gives way, see `give_way`, and a refinement ends if it is cancelled. Nobody waits for a slot within a slot, nor
-    within a `functools.cached_property`: Python 3.10 and 3.11 lock it for all instances.
+    Slots are given by rank; among equals who owes least comes first, and of these who has waited longest; so that
+    nobody is left out, who has waited longest of all comes first once in a while. One slot is for hands only, unless
+    there is only one: a hand waits for other hands alone. At checkpoints what follows no hand gives way, see
+    `give_way`, and a refinement ends if it is cancelled. Nobody waits for a slot within a slot, nor within a
+    `functools.cached_property`: Python 3.10 and 3.11 lock it for all instances.
     """
 
     def __init__(self, num: int = os.cpu_count() or 1, settings: CoresSettings = CoresSettings()) -> None:
@@ -86,13 +92,14 @@ class Cores:
         """Notified when somebody gives a slot back."""
         self._num, self._most = num, {True: settings.num_hands, False: max(1, num - 1)}
         """Number of slots, and of those of hands and of all else."""
-        self._numbers = itertools.count()
         self.queue: list[_Place] = []
         """Those who wait; the smallest is next."""
         self._held: list[_Place] = []
         """Those who have a slot."""
         self._followed = -math.inf
         """When a slot that followed a hand was last given back, of `time.monotonic`."""
+        self._last_due = -math.inf
+        """When somebody last got a slot because he had waited longest, of `time.monotonic`."""
         self._between = threading.Lock()
         """Held by one of those within `between_hands`."""
         self._num_long, self._usual_turn = 0, sys.getswitchinterval()
@@ -111,7 +118,7 @@ class Cores:
             UnwantedError: it is cancelled; a checkpoint raises it, too.
         """
         end_if(cancelled)
-        place = _Place(rank, settle(), next(self._numbers), threading.get_ident(), threading.Event())
+        place = _Place(rank, settle(), time.monotonic())
         with self._lock:
             self.queue.append(place)
             self._admit()
@@ -120,8 +127,7 @@ class Cores:
                 place.woken.wait(None if rank is Rank.HAND else self._settings.look)
                 place.woken.clear()
                 end_if(cancelled)
-            refines = rank is Rank.REFINEMENT
-            with checked(never if rank is Rank.HAND else partial(self.give_way, cancelled, refines=refines)):
+            with checked(never if rank is Rank.HAND else partial(self.give_way, cancelled, place)):
                 yield
         finally:
             settle()
@@ -139,27 +145,37 @@ class Cores:
                 if place.thread == thread and place.rank is not Rank.HAND:
                     place.woken.set()
 
-    def give_way(self, cancelled: Cancelled = never, *, refines: bool = False) -> None:
+    def give_way(self, cancelled: Cancelled = never, place: _Place | None = None) -> None:
         """Pause where others come first, for `longest` at most; called at checkpoints, within a slot or not.
 
-        A refinement pauses while another slot follows a hand. A thread whose account is overdrawn also pauses between
-        the frames of a drag, and while an account that owes less has a slot.
+        A refinement pauses while another slot is for something else. A thread whose account is overdrawn also pauses
+        between the frames of a drag, and while an account that owes less has a slot. Meanwhile its own slot, if it has
+        one, is free for what comes first.
 
         Raises:
             UnwantedError: it is cancelled.
         """
         debt, own, now = settle(), threading.get_ident(), time.monotonic()
+        refines = place is not None and place.rank is Rank.REFINEMENT
         pauses = refines or (debt and now - _thread.went_on > self._settings.least)
         longest = now + self._settings.longest if pauses else now
         with self._left:
             while now < longest and not cancelled():
-                others = [place for place in self._held if place.thread != own]
-                come_first = any(place.rank is Rank.HAND or place.debt < debt for place in others)
+                others = [other for other in (self._held + self.queue if place else self._held) if other.thread != own]
+                come_first = any(
+                    other.rank is Rank.HAND or other.debt < debt or (refines and other.rank < Rank.REFINEMENT)
+                    for other in others
+                )
                 until = longest if come_first else min(longest, self._followed + self._settings.gap if debt else now)
                 if until <= now:
                     break
+                if place is not None and not place.pauses:
+                    place.pauses = True
+                    self._admit()
                 self._left.wait(until - now)
                 now = _thread.went_on = time.monotonic()
+            if place is not None:
+                place.pauses = False
         end_if(cancelled)
 
     @contextmanager
@@ -202,12 +218,23 @@ class Cores:
 
     def _admit(self) -> None:
         """Give slots to those who are next, as far as there are any; nothing refines while a hand waits."""
-        for place in sorted(self.queue):
+        now = time.monotonic()
+        due = min(self.queue, key=lambda place: place.came, default=None)
+        if due is not None and now - max(due.came, self._last_due) < self._settings.patience:
+            due = None
+        for place in sorted(self.queue, key=lambda place: (place is not due, place)):
             hands_wait = any(other.rank is Rank.HAND for other in self.queue)
-            if len(self._held) == self._num or (place.rank is Rank.REFINEMENT and hands_wait):
+            if place.rank is Rank.REFINEMENT and hands_wait and place is not due:
                 return
             follows = place.rank is Rank.HAND
-            if sum((held.rank is Rank.HAND) == follows for held in self._held) < self._most[follows]:
+            taken = [(held.rank is Rank.HAND) == follows for held in self._held if not held.pauses or held < place]
+            if len(taken) < self._num and sum(taken) < self._most[follows]:
                 self.queue.remove(place)
                 self._held.append(place)
                 place.woken.set()
+                if place is due:
+                    self._last_due = now
+
+
+CORES = Cores()
+"""Slots of all that this process computes."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import TypeVar
 
@@ -32,7 +32,7 @@ from dt_viz.scenario.scenario import Layer, Scenario, Start
 from dt_viz.scenario.tasks import OWN, STYLES, Task, TaskEntry
 from dt_viz.session.certify import certify, clearance, uncertified, with_meshes
 from dt_viz.session.comparison import Comparison
-from dt_viz.session.cores import Cores, Rank
+from dt_viz.session.cores import CORES, Rank
 from dt_viz.session.drawing import Drawing, arm_along, rollouts_of
 from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.robot_loop import LiveArm
@@ -47,23 +47,6 @@ NOT_TURNED = "the arm does not get there with the hand turned as demonstrated: i
 """Warning where orientations are left out."""
 
 _Result = TypeVar("_Result")
-_cores = Cores()
-"""Slots of all engines."""
-
-
-def wake(thread: int) -> None:
-    """Have what waits for a slot on a thread ask whether it is still wanted."""
-    _cores.wake(thread)
-
-
-def give_way() -> None:
-    """Pause if this thread's account is overdrawn and others come first; see `Cores.give_way`."""
-    _cores.give_way()
-
-
-def between_hands() -> AbstractContextManager[None]:
-    """Wait for a moment to move an arm in, and have it within the block; see `Cores.between_hands`."""
-    return _cores.between_hands()
 
 
 class Engine:
@@ -128,7 +111,7 @@ class Engine:
     @contextmanager
     def refining(self, cancelled: Cancelled) -> Iterator[None]:
         """Wait for a core, and have it, as what refines has: whoever drags comes first. Raises as `Cores.slot`."""
-        with _cores.slot(Rank.REFINEMENT, cancelled), _cores.short_turns():
+        with CORES.slot(Rank.REFINEMENT, cancelled), CORES.short_turns():
             yield
 
     def frames(
@@ -167,12 +150,12 @@ class Engine:
         if steps:
             learn(1.0, "computing the motion; what is new to this processor is compiled, once")
         rank = Rank.BEGINNING if scenario.passing is ANEW else Rank.HAND
-        with _cores.slot(rank):
+        with CORES.slot(rank):
             scenario = newest(scenario)
             frame = self._rollouts(scenario, LIVE)
             draw(frame)
         yield frame
-        with _cores.slot(rank):
+        with CORES.slot(rank):
             frame = self._seen(frame, Stage.LIVE, learned)
             draw(frame)
         yield frame
@@ -180,13 +163,13 @@ class Engine:
         yield frame
         frame = replace(frame, stage=Stage.CERTIFIED)
         if not frame.blocked:
-            with _cores.slot(Rank.REFINEMENT, cancelled):
+            with CORES.slot(Rank.REFINEMENT, cancelled):
                 frame = replace(frame, certificates=self._certified(frame))
-            with _cores.slot(Rank.REFINEMENT, cancelled):
+            with CORES.slot(Rank.REFINEMENT, cancelled):
                 frame = replace(frame, certificates=self._certified_with_meshes(frame))
         yield frame
         if frame.motion.arm is not None and not frame.blocked:
-            with _cores.slot(Rank.REFINEMENT, cancelled):
+            with CORES.slot(Rank.REFINEMENT, cancelled):
                 self.follower.reference_postures(frame.motion.nominal.learned)  # a drag may need them at once
         yield from self._compared_at_rest(frame, cancelled)
 
@@ -199,9 +182,9 @@ class Engine:
             self._last = last
 
     def _fine(self, scenario: Scenario, others: Mapping[Panel, Learned], cancelled: Cancelled) -> Frame:
-        with _cores.slot(Rank.REFINEMENT, cancelled):
+        with CORES.slot(Rank.REFINEMENT, cancelled):
             frame = self._rollouts(scenario, FINE)
-        with _cores.slot(Rank.REFINEMENT, cancelled):
+        with CORES.slot(Rank.REFINEMENT, cancelled):
             return self._seen(frame, Stage.FINE, others)
 
     def _shown(self, scenario: Scenario, progress: Progress | None = None) -> Mapping[Panel, Learned]:
@@ -239,7 +222,7 @@ class Engine:
         return self._learn(scenario, self.own[scenario.task][1], progress)
 
     def _learn(self, scenario: Scenario, fits: FitStore, progress: Progress | None) -> Learned:
-        with _cores.short_turns():
+        with CORES.short_turns():
             learned = learned_of(scenario, self.task(scenario.task), fits, progress)
         imitation = learned.imitation
         if isinstance(imitation, AugmentedImitation) and learned.poses and self.follower.unreached(learned):
@@ -398,7 +381,7 @@ class Engine:
 
         left = self.comparison.complete(frame, self._plain(frame.scenario), asked)
         while True:
-            with _cores.slot(Rank.REFINEMENT, cancelled):
+            with CORES.slot(Rank.REFINEMENT, cancelled):
                 notes = next(left, None)
                 if notes is None:
                     return

@@ -21,7 +21,8 @@ from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import IMITATION, as_fresh
 from dt_viz.scenario.tasks import Task
 from dt_viz.session.arms import Engines, NewEngine
-from dt_viz.session.engine import Engine, give_way, wake
+from dt_viz.session.cores import CORES
+from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.history import Beside, History
 from dt_viz.session.jobs import Jobs
@@ -84,7 +85,7 @@ class Session:
         self._edits = Edits()
         self._computed = self.scenario
         """Scenario that is computed now, or was last."""
-        self.jobs = Jobs(self.fail, account, wake, give_way)
+        self.jobs = Jobs(self.fail, account, CORES.wake, CORES.give_way)
         """All work of the visitor beside the server's event loop."""
         self._adopt()
         self._submit()

@@ -29,7 +29,8 @@ from dt_viz.scenario.tasks import TASKS, Task
 from dt_viz.serving.board import Share
 from dt_viz.session.arms import ArmStore
 from dt_viz.session.comparison import OTHERS
-from dt_viz.session.engine import Engine, between_hands
+from dt_viz.session.cores import CORES, Rank
+from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.opening import Preview
 from dt_viz.session.progress import Display, Pace, Progress
@@ -126,7 +127,7 @@ class Visitor(Display):
         """Whether takes are seen that are not learned yet, and whether they are being learned."""
         self._dress(LIGHT)
         client.gui.set_panel_label("DT-Viz")
-        with client.atomic():
+        with CORES.slot(Rank.PAGE), client.atomic():
             self.pictures = ScenePictures(client.scene, robot, lambda: self.session)
             self.robot = RobotScene(client, robot, Playback(engine.arm, self._pose))
         self._exchanging = threading.RLock()  # the arm is moved, drawn, and shown or hidden, by different threads
@@ -135,7 +136,7 @@ class Visitor(Display):
         pen = Pen(self.pictures, lambda: self.robot, lambda: self.session, self._face)
         self._keeper = Keeper(client.local_storage, known_names(titles, titled), self._made, begins)
         self._camera = CameraController(client, lambda: self.robot.hand, robot.size, self._keeper.changed)
-        with client.atomic():
+        with CORES.slot(Rank.PAGE), client.atomic():
             self._panel = ControlPanel(
                 client.gui,
                 titles,
@@ -170,7 +171,7 @@ class Visitor(Display):
         self._panel.tour.begin(self.session)
         self.ruler = Ruler()
         """What the visitor's window is measured with."""
-        self.robot.playback.begin(self.session.jobs, self.session.fail, between_hands)
+        self.robot.playback.begin(self.session.jobs, self.session.fail, CORES.between_hands)
         keep_ready(self)
 
     def measure(self) -> None:
@@ -327,7 +328,7 @@ class Visitor(Display):
             self.robot.adopt(self.session.scenario.view, self.pictures.look)
             self.robot.set_aside(self._previews is not False)
             self._panel.take(robot)
-        self.robot.playback.begin(self.session.jobs, self.session.fail, between_hands)  # and the one before ends
+        self.robot.playback.begin(self.session.jobs, self.session.fail, CORES.between_hands)  # and the one before ends
         self._camera.reframe(arm_size=robot.size)
 
     @contextmanager

@@ -58,6 +58,19 @@ def test_the_next_place_is_for_who_has_waited_longest_wherever(shares):
         assert is_free
 
 
+@pytest.mark.parametrize("num_places", range(1, 7))
+def test_who_came_before_in_another_process_is_waited_for_only_where_he_needs_the_place(shares, num_places):
+    first, second, third = shares
+    first.seat(1, [5.0, 6.0])
+    second.seat(0, [3.0, 4.0])
+    for share, num_before in ((second, 0), (first, 2)):
+        with share.next_place(num_places) as is_free:
+            assert is_free == (1 + num_before < num_places)
+    third.seat(1, [])
+    with first.next_place(num_places) as is_free:
+        assert is_free == (num_places > 4)
+
+
 def test_the_row_of_a_process_that_has_ended_counts_no_more(board, shares):
     shares[1].seat(2, [1.0])
     shares[1].connect("a")

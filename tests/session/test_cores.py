@@ -19,14 +19,14 @@ PATIENCE = 30
 class Crowd:
     """Threads that want slots, and the order in which they get them; each keeps its own until it is let go."""
 
-    def __init__(self, num, num_hands=None):
-        settings = CoresSettings(num_hands=num_hands or num)
+    def __init__(self, num, num_hands=None, patience=10.0 * PATIENCE):
+        settings = CoresSettings(num_hands=num_hands or num, patience=patience)
         self.cores, self.order, self.threads, self.let_go = Cores(num, settings), [], {}, {}
         self._got = threading.Condition()
 
     def come(self, name, cancelled=never, account=None):
-        """Returns when this one waits or has a slot. Those whose names are upper case refine."""
-        rank = Rank.REFINEMENT if name.isupper() else Rank.HAND
+        """Returns when this one waits or has a slot. Upper case refines, and numbers are pages."""
+        rank = Rank.REFINEMENT if name.isupper() else Rank.PAGE if name.isdigit() else Rank.HAND
         self.let_go[name] = threading.Event()
 
         def want():
@@ -87,6 +87,44 @@ def test_who_follows_a_hand_goes_first_and_else_who_came_first(crowd):
         crowd.come(name)
     crowd.go("x", "b", "d", "A")
     assert crowd.order == ["x", "b", "d", "A", "C"]
+
+
+@pytest.mark.parametrize("crowd", [[1, 1]], indirect=True)
+def test_pages_are_built_after_hands_and_before_anybody_refines(crowd):
+    for name in "xA1b2":
+        crowd.come(name)
+    crowd.go("x", "b", "1", "2")
+    assert crowd.order == ["x", "b", "1", "2", "A"]
+
+
+@pytest.mark.parametrize("crowd", [[1, 1, 0.2]], indirect=True)
+def test_who_has_waited_longest_comes_first_once_in_a_while(crowd):
+    """Else nobody would refine, nor have a page, while two drag without a pause on a single core."""
+    came = monotonic()
+    for name in "aB1c":
+        crowd.come(name)
+    threading.Event().wait(0.2)
+    crowd.go("a")
+    assert crowd.order == ["a", "B"] and monotonic() - came >= 0.2
+    crowd.come("d")
+    crowd.let_go["B"].set()
+    crowd.threads["B"].join(PATIENCE)
+    crowd._settle()
+    is_late = monotonic() - came >= 0.4  # on a machine that is slow it is the turn of the page already
+    assert crowd.order[2:] == ["1"] if is_late else ["c"]
+    if not is_late:
+        threading.Event().wait(0.2)
+        crowd.go("c")
+        assert crowd.order == ["a", "B", "c", "1"]
+
+
+def test_a_hand_waits_no_longer_for_who_refines_because_that_one_has_waited_longest():
+    crowd = Crowd(2, 1, patience=0.0)
+    for name in "aBcD":
+        crowd.come(name)
+    crowd.go("a")
+    assert crowd.order == ["a", "B", "c"]
+    crowd.close()
 
 
 @pytest.mark.parametrize("crowd", [[2], [3]], indirect=True)
@@ -354,31 +392,97 @@ def test_a_beginning_waits_for_one_slot_only_while_hands_wait_for_theirs():
         thread.join(PATIENCE)
 
 
-def test_a_refinement_does_not_pause_for_a_hand_that_waits_for_its_slot():
-    cores, hand_waits, went_on = Cores(1, CoresSettings(longest=PATIENCE)), threading.Event(), threading.Event()
+class Pausing:
+    """A thread within a slot that calls checkpoints when it is told to; it notes that it has gone on after each."""
 
-    def refine():
-        with cores.slot(Rank.REFINEMENT):
-            hand_waits.wait(PATIENCE)
-            checkpoint()
-            went_on.set()
+    def __init__(self, cores, rank=Rank.REFINEMENT, account=None):
+        self._come, self.went_on, self._ends, has_slot = (threading.Event() for _ in range(4))
 
-    def follow():
-        with cores.slot():
-            pass
+        def compute():
+            with charged(account), cores.slot(rank):
+                has_slot.set()
+                while self._come.wait(PATIENCE) and not self._ends.is_set():
+                    self._come.clear()
+                    checkpoint()
+                    self.went_on.set()
 
-    threads = [threading.Thread(target=work) for work in (refine, follow)]
-    threads[0].start()
-    while not cores._held:
+        self._thread = threading.Thread(target=compute, daemon=True)
+        self._thread.start()
+        assert has_slot.wait(PATIENCE)
+
+    def checkpoint(self):
+        self.went_on.clear()
+        self._come.set()
+
+    def end(self):
+        self._ends.set()
+        self._come.set()
+        self._thread.join(PATIENCE)
+        assert not self._thread.is_alive()
+
+
+@pytest.mark.parametrize("rank", [Rank.HAND, Rank.BEGINNING, Rank.PAGE, Rank.REFINEMENT])
+@pytest.mark.parametrize("num", [1, 2])
+def test_at_a_checkpoint_a_refinement_lends_its_slot_to_all_but_another_refinement(num, rank):
+    cores, has_slot, may_end = Cores(num, CoresSettings(longest=10 * PATIENCE)), threading.Event(), threading.Event()
+
+    def come():
+        with cores.slot(rank):
+            has_slot.set()
+            may_end.wait(PATIENCE)
+
+    refines, other = Pausing(cores), threading.Thread(target=come)
+    other.start()
+    while not cores.queue and not has_slot.is_set():
         threading.Event().wait(0.001)
-    threads[1].start()
-    while not cores.queue:
-        threading.Event().wait(0.001)
-    hand_waits.set()
-    assert went_on.wait(PATIENCE / 3)
-    for thread in threads:
-        thread.join(PATIENCE)
-        assert not thread.is_alive()
+    assert has_slot.is_set() == (rank is Rank.HAND and num == 2)
+    refines.checkpoint()
+    lends = rank is not Rank.REFINEMENT
+    assert has_slot.wait(PATIENCE if lends else 0.2) == lends
+    assert refines.went_on.wait(0.2 if lends else PATIENCE) != lends
+    may_end.set()
+    assert refines.went_on.wait(PATIENCE)
+    refines.end()
+    other.join(PATIENCE)
+    assert not cores._held and not cores.queue
+
+
+def test_a_slot_is_lent_to_one_only_and_is_taken_again():
+    settings = CoresSettings(longest=10 * PATIENCE, patience=10 * PATIENCE)
+    cores, refines, others = Cores(2, settings), None, {}
+    refines = Pausing(cores)
+    for name, rank in (("a page", Rank.PAGE), ("another page", Rank.PAGE), ("a refinement", Rank.REFINEMENT)):
+        others[name] = threading.Event(), threading.Event()
+
+        def come(rank=rank, has_slot=others[name][0], may_end=others[name][1]):
+            with cores.slot(rank):
+                has_slot.set()
+                may_end.wait(PATIENCE)
+
+        threading.Thread(target=come, daemon=True).start()
+        while len(cores.queue) < len(others):
+            threading.Event().wait(0.001)
+    refines.checkpoint()
+    for name in ("a page", "another page"):
+        assert others[name][0].wait(PATIENCE)
+        assert not refines.went_on.is_set() and len(cores._held) == 2
+        others[name][1].set()
+    assert refines.went_on.wait(PATIENCE)
+    assert not others["a refinement"][0].wait(0.2)
+    refines.end()
+    assert others["a refinement"][0].wait(PATIENCE)
+    others["a refinement"][1].set()
+
+
+def test_who_lends_his_slot_goes_on_after_a_while_also_beside_the_other():
+    cores = Cores(2, CoresSettings(longest=0.3))
+    refines = Pausing(cores)
+    with cores.slot(Rank.HAND):
+        began = monotonic()
+        refines.checkpoint()
+        assert refines.went_on.wait(PATIENCE) and monotonic() - began >= 0.3
+        assert len(cores._held) == 2 and not any(place.pauses for place in cores._held)
+    refines.end()
 
 
 def test_a_refinement_that_is_cancelled_ends_at_its_next_checkpoint():

@@ -285,7 +285,7 @@ def test_wherever_refining_is_cancelled_it_leaves_nothing_half_done(fits, robot,
 @pytest.mark.parametrize("stage", [Stage.LIVE, Stage.FINE])
 def test_a_hand_is_followed_while_all_others_refine(new_engine, initial, monkeypatch, stage):
     cores = Cores(2)
-    monkeypatch.setattr(engine_module, "_cores", cores)
+    monkeypatch.setattr(engine_module, "CORES", cores)
     frames = new_engine().frames(initial("lift_box"))
     if stage is Stage.LIVE:
         with cores.slot(Rank.REFINEMENT):
@@ -304,7 +304,7 @@ def test_a_hand_is_followed_while_all_others_refine(new_engine, initial, monkeyp
 def test_refining_that_is_not_wanted_any_more_does_not_wait_for_its_slot(new_engine, initial, monkeypatch):
     """Else a hand that moves again would wait for all others to rest."""
     cores, ended, unwanted = Cores(1), threading.Event(), threading.Event()
-    monkeypatch.setattr(engine_module, "_cores", cores)
+    monkeypatch.setattr(engine_module, "CORES", cores)
     frames = new_engine().frames(initial("draw_s"), cancelled=unwanted.is_set)
 
     def refine():
@@ -324,7 +324,7 @@ def test_refining_that_is_not_wanted_any_more_does_not_wait_for_its_slot(new_eng
 def test_the_first_picture_of_a_task_takes_no_slot_of_a_hand(new_engine, initial, monkeypatch, passing, rank):
     cores, taken = Cores(2), []
     slot = cores.slot
-    monkeypatch.setattr(engine_module, "_cores", cores)
+    monkeypatch.setattr(engine_module, "CORES", cores)
     monkeypatch.setattr(cores, "slot", lambda rank=Rank.HAND, *more: (taken.append(rank), slot(rank, *more))[1])
     frame_at(new_engine(), replace(initial("draw_s"), passing=passing), Stage.LIVE)
     assert taken == [rank, rank]
@@ -332,7 +332,7 @@ def test_the_first_picture_of_a_task_takes_no_slot_of_a_hand(new_engine, initial
 
 def test_what_follows_a_hand_is_drawn_in_the_slot_it_was_computed_in(new_engine, initial, monkeypatch):
     cores, drawn, held = Cores(2), [], []
-    monkeypatch.setattr(engine_module, "_cores", cores)
+    monkeypatch.setattr(engine_module, "CORES", cores)
 
     def draw(frame):
         drawn.append(frame)
@@ -382,7 +382,7 @@ def test_as_a_task_begins_it_is_computed_once_for_all_visitors_who_are_not_kept_
 
 def test_who_learns_or_compares_gives_way_between_parts(new_engine, initial, monkeypatch):
     cores, paused, told = Cores(2), [], []
-    monkeypatch.setattr(engine_module, "_cores", cores)
+    monkeypatch.setattr(engine_module, "CORES", cores)
     monkeypatch.setattr(cores, "give_way", lambda *_, **__: paused.append(len(told)))
 
     def compare(_frame, _learned, cancelled):
@@ -404,7 +404,7 @@ def test_who_learns_or_compares_gives_way_between_parts(new_engine, initial, mon
 
     monkeypatch.setattr(Engine, "nominal", learn)
     scenario = replace(scenario, view=replace(scenario.view, compared=("linear",)))
-    with checked(engine_module.give_way):
+    with checked(cores.give_way):
         list(engine.frames(scenario, lambda _fraction, message: told.append(message)))
     assert told[:2] == ["half", "more"] and told[-1] == 1
 

@@ -24,8 +24,8 @@ from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.slices import SlicePose
 from dt_viz.scenario.stack import IMITATION, with_added, without
 from dt_viz.scenario.tasks import TASKS
-from dt_viz.session import engine as engine_module
 from dt_viz.session import session as session_module
+from dt_viz.session.cores import CORES
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Stage
 from dt_viz.session.history import GESTURE_PAUSE, MAX_UNDO, Beside
@@ -499,9 +499,10 @@ def test_a_session_that_closes_ends_what_it_computes_for_a_hand(opened, stage):
     assert opened.page.errors == []
 
 
-def test_all_work_of_a_visitor_gives_way_to_others_at_its_checkpoints(opened, monkeypatch):
+def test_all_work_of_a_visitor_gives_way_to_others_at_its_checkpoints(monkeypatch, request):
     paused = []
-    monkeypatch.setattr(engine_module._cores, "give_way", lambda: paused.append(threading.current_thread().name))
+    monkeypatch.setattr(CORES, "give_way", lambda: paused.append(threading.current_thread().name))
+    opened = request.getfixturevalue("opened")
     opened.session.jobs.submit("reading", checkpoint)
     assert opened.session.jobs.wait_idle(timeout=PATIENCE)
     assert paused == ["reading"]

@@ -27,11 +27,13 @@ from websockets.typing import Subprotocol
 from dt_viz.evaluate.protocol_client import OBSTACLE, ROLLOUT, LostError, ProtocolClient
 from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.tasks import TASKS
+from dt_viz.serving.board import Board, Share
 from dt_viz.serving.listening import listen
-from dt_viz.session.cores import Cores
+from dt_viz.session.cores import Cores, CoresSettings, Rank
 from dt_viz.session.progress import Pace
 from dt_viz.ui import gate, keeping
 from dt_viz.ui import server as server_module
+from dt_viz.ui import visitor as visitor_module
 from dt_viz.ui.keeping import ATTEMPTS, KEY
 from dt_viz.ui.origins import Origin
 from dt_viz.ui.panel import MAX_UPLOAD
@@ -74,7 +76,7 @@ def server(fits):
 @pytest.fixture
 def url(server):
     """Of the WebSocket; nobody is left over from another test."""
-    wait_until(lambda: not server._server.get_clients() and not server.visitors, PATIENCE)
+    wait_until(lambda: not server._server.get_clients() and not server.visitors and not server._num_building, PATIENCE)
     return f"ws://127.0.0.1:{server.port}"
 
 
@@ -292,6 +294,22 @@ async def test_who_waits_is_told_so_and_has_the_next_place_that_is_free(url, ser
         assert not waits(first) and waits(last) and len(server.visitors) == NUM_PLACES
 
 
+@asynchronous
+async def test_nobody_waits_for_who_came_before_to_another_process_while_both_have_a_place(url, server, monkeypatch):
+    """Nobody attends to those who wait: they would have a place at last, one every half second."""
+    board = Board(2, NUM_PLACES + MAX_WAITING)
+    here, elsewhere = Share(board, 0), Share(board, 1)
+    elsewhere.seat(0, [0.0])
+    monkeypatch.setattr(server, "_share", here)
+    async with visiting(url), Client(url) as waiting:
+        await waiting.look()
+        assert await waiting.wait_for(lambda: here.num_waiting == 2, PATIENCE)
+        assert not await waiting.wait_for(lambda: waiting.has_picture, 0.5)
+        elsewhere.seat(0, [])
+        await asyncio.to_thread(server.attend)
+        assert await waiting.wait_for(lambda: waiting.has_picture, PATIENCE)
+
+
 @pytest.mark.long
 @asynchronous
 async def test_who_does_nothing_gives_his_place_to_one_who_waits_and_only_then(url, server):
@@ -382,6 +400,24 @@ async def test_the_arm_of_a_page_moves_only_between_hands(url, server, monkeypat
             may_move.set()
             await asyncio.to_thread(wait_until, lambda: moments() > held, PATIENCE)  # noqa: B023
             await asyncio.to_thread(visitor._exchange, "")
+
+
+@asynchronous
+async def test_a_page_is_built_before_anybody_refines_and_after_first_pictures(url, monkeypatch):
+    """While it asks the browser, no slot is taken: others need it, and a browser may not answer at all."""
+    cores, asked, taken = Cores(2, CoresSettings(patience=10 * PATIENCE)), [], []
+    slot = cores.slot
+    monkeypatch.setattr(visitor_module, "CORES", cores)
+    monkeypatch.setattr(cores, "slot", lambda rank=Rank.HAND, *more: (taken.append(rank), slot(rank, *more))[1])
+    ask = keeping.Keeper._ask
+    monkeypatch.setattr(keeping.Keeper, "_ask", lambda keeper: (asked.append(len(cores._held)), ask(keeper))[1])
+    async with Client(url) as client:
+        with slot(Rank.BEGINNING):
+            await client.look()
+            await come_true(lambda: cores.queue)
+            assert not await client.wait_for(lambda: client.controls, 0.5)
+        assert await client.wait_for(lambda: client.has_picture, PATIENCE)
+    assert (taken, asked) == ([Rank.PAGE, Rank.PAGE], [0])
 
 
 @asynchronous
