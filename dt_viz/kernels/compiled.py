@@ -21,6 +21,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
+import llvmlite.binding
 import numba
 from numba.core.compiler import CompileResult
 from numba.core.registry import CPUDispatcher, cpu_target
@@ -93,7 +94,9 @@ class _Cache:
 
     def save_overload(self, signature: object, result: CompileResult) -> None:
         """Keep the code for these types of arguments, if the folder can be written."""
-        path, data = self._path(signature, result.codegen), dumps(result._reduce())
+        (name, kind, (machine_code, bitcode)), *rest = result._reduce()
+        path = self._path(signature, result.codegen)
+        data = dumps([(name, kind, (machine_code, _hollow(bitcode))), *rest])
         unfinished = path.with_name(f"{path.name}.{os.getpid()}.unfinished")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -106,6 +109,17 @@ class _Cache:
 
     def _path(self, signature: object, codegen: Any) -> Path:  # noqa: ANN401 - numba's
         return _file(self._name, (signature, codegen.magic_tuple(), _version()))
+
+
+def _hollow(bitcode: bytes) -> bytes:
+    """Return bitcode of functions with the same names that do nothing.
+
+    Numba needs names to find the machine code, and bodies to compile what calls a kernel, which nothing does. Bodies
+    take 2 MB of each process that loads a kernel.
+    """
+    functions = (each for each in llvmlite.binding.parse_bitcode(bitcode).functions if not each.is_declaration)
+    hollow = "\n".join(f'define void @"{each.name}"() {{ ret void }}' for each in functions)
+    return llvmlite.binding.parse_assembly(hollow).as_bitcode()
 
 
 def _file(name: str, key: object) -> Path:

@@ -1,10 +1,19 @@
 """Compiled code is kept: one process compiles all of it while others wait for what they need."""
 
+import pickle
+import subprocess
+import sys
 import threading
+from collections.abc import Iterator
+from importlib import import_module
+from pkgutil import iter_modules
 from typing import Any
 
+import llvmlite.binding
 import pytest
+from numba.core.registry import CPUDispatcher
 
+from dt_viz import kernels
 from dt_viz.kernels import compiled
 from dt_viz.kernels.compiled import compiling_all, complete, short_kernel
 
@@ -35,6 +44,43 @@ def kept(folder, tmp_path):
     (file,) = folder.glob("test_compiled.twice-*")
     hidden = file.rename(tmp_path / "hidden")
     return lambda: hidden.rename(file)
+
+
+def dispatchers() -> Iterator[Any]:
+    """All that numba compiles of this project."""
+    for module in iter_modules(kernels.__path__, "dt_viz.kernels."):
+        yield from (each for each in vars(import_module(module.name)).values() if isinstance(each, CPUDispatcher))
+
+
+def is_kernel(dispatcher: Any) -> bool:
+    return isinstance(dispatcher._cache, compiled._Cache)
+
+
+def test_no_kernel_is_called_by_what_is_compiled_as_its_bitcode_is_not_kept():
+    found = [each for each in dispatchers() if is_kernel(each)]
+    assert found
+    for dispatcher in dispatchers():
+        function = dispatcher.py_func
+        called = [function.__globals__.get(name) for name in function.__code__.co_names]
+        assert not [each for each in called if isinstance(each, CPUDispatcher) and is_kernel(each)], function
+
+
+USE = """
+from tests.kernels.test_compiled import loads, short_kernel, twice
+kernel = short_kernel(twice)
+print(kernel(2.0), kernel(3.0), loads(kernel))
+"""
+
+
+def test_what_is_kept_of_a_kernel_is_its_machine_code_and_another_process_loads_it(folder):
+    for num_loads in (0, 1):
+        done = subprocess.run([sys.executable, "-c", USE], capture_output=True, text=True, check=True)
+        assert done.stdout.split() == ["4.0", "6.0", str(num_loads)]
+    (file,) = folder.glob("test_compiled.twice-*")
+    (_name, kind, (machine_code, bitcode)), *_ = pickle.loads(file.read_bytes()[32:])
+    assert kind == "object" and len(machine_code) > 1000
+    functions = list(llvmlite.binding.parse_bitcode(bitcode).functions)
+    assert functions and all(len(list(block.instructions)) == 1 for each in functions for block in each.blocks)
 
 
 def test_who_needs_a_kernel_waits_while_all_are_compiled_and_loads_it_then(kept):
