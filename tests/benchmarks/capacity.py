@@ -128,7 +128,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         ("within", 0.5, "that time, seconds"),
         ("kilobytes", 60.0, "size of a picture, kB"),
         ("process", 380.0, "memory of a process, MB"),
-        ("visitor", 20.0, "memory of a visitor, MB"),
+        ("visitor", 13.0, "memory of a visitor, MB"),
         ("core-price", 10.0, "price of a core and its memory for a month, €"),
         ("gigabyte-price", 0.02, "price of a GB that is sent, €"),
     ):
