@@ -90,7 +90,9 @@ class _Cache:
         if hashlib.sha256(data).digest() != checksum:
             logger.warning("the compiled code in %s is damaged: it is made again", path)
             return None
-        return CompileResult._rebuild(target_context, *pickle.loads(data))
+        result = CompileResult._rebuild(target_context, *pickle.loads(data))
+        result.library._shared_module = None  # numba refuses to link it, rather than link what does nothing
+        return result
 
     def save_overload(self, signature: object, result: CompileResult) -> None:
         """Keep the code for these types of arguments, if the folder can be written."""
@@ -114,8 +116,8 @@ class _Cache:
 def _hollow(bitcode: bytes) -> bytes:
     """Return bitcode of functions with the same names that do nothing.
 
-    Numba needs names to find the machine code, and bodies to compile what calls a kernel, which nothing does. Bodies
-    take 2 MB of each process that loads a kernel.
+    Numba needs names to find the machine code, and bodies only to link a kernel into other compiled code, which calls
+    none. Bodies take 2 MB of each process that loads a kernel.
     """
     functions = (each for each in llvmlite.binding.parse_bitcode(bitcode).functions if not each.is_declaration)
     hollow = "\n".join(f'define void @"{each.name}"() {{ ret void }}' for each in functions)

@@ -140,7 +140,7 @@ class Share:
 
     @contextmanager
     def next_place(self, num_places: int) -> Iterator[bool]:
-        """Yield whether there is a place for who waits longest here, beside those who came before him elsewhere.
+        """Yield whether there is a place for who waits longest here, and for all who came before him elsewhere.
 
         Until it is told who takes it, no other may.
         """

@@ -27,7 +27,7 @@ class CoresSettings:
     look: float = 0.25
     """Interval at which what waits and may be cancelled asks whether it is still wanted, unless it is woken before."""
     longest: float = 0.25
-    """Longest time for which who has overdrawn, refines or moves an arm gives way at once: he goes on, if slowly."""
+    """Longest single pause of what gives way: then it computes until its next checkpoint."""
     gap: float = 0.15
     """Time after a frame of a drag for which overdrawn accounts still give way: the next frame is about to begin."""
     least: float = 0.05
@@ -35,7 +35,7 @@ class CoresSettings:
     pause: float = 0.05
     """Longest time for which an arm whose turn it is to be moved waits while a hand is followed."""
     patience: float = 1.0
-    """Longest time for which who has waited longest is passed over for those whose rank or debt is smaller."""
+    """Interval at which whoever has waited longest, if for as long, comes first, whatever his rank and debt."""
     turn: float = 0.0005
     """Time for which a thread keeps the interpreter while another one waits for it, beside `Cores.short_turns`."""
 
@@ -62,7 +62,7 @@ _thread = _Thread()
 
 @dataclass(order=True)
 class _Place:
-    """A place in the queue, or a slot; the smallest comes first."""
+    """A thread that waits for a slot or has one; of those who wait, the smallest comes first."""
 
     rank: Rank
     debt: float
@@ -71,18 +71,19 @@ class _Place:
     """Time of arrival, of `time.monotonic`."""
     thread: int = field(default_factory=threading.get_ident)
     woken: threading.Event = field(default_factory=threading.Event, compare=False)
+    has_slot: bool = field(default=False, compare=False)
     pauses: bool = field(default=False, compare=False)
-    """Whether it gives way at a checkpoint."""
+    """Whether it pauses at a checkpoint now, so that its slot is lent to smaller ranks."""
 
 
 class Cores:
     """A bounded semaphore with priorities.
 
-    Slots are given by rank; among equals who owes least comes first, and of these who has waited longest; so that
-    nobody is left out, who has waited longest of all comes first once in a while. One slot is for hands only, unless
-    there is only one: a hand waits for other hands alone. At checkpoints what follows no hand gives way, see
-    `give_way`, and a refinement ends if it is cancelled. Nobody waits for a slot within a slot, nor within a
-    `functools.cached_property`: Python 3.10 and 3.11 lock it for all instances.
+    Slots are given by rank; among equals who owes least comes first, and of these who has waited longest. Nobody is
+    left out: once in a while whoever has waited longest of all comes first. One slot is for hands only, unless there is
+    only one: a hand waits for other hands alone. At checkpoints what follows no hand gives way, and lends its slot
+    meanwhile, see `give_way`; a refinement ends there if it is cancelled. Nobody waits for a slot within a slot, nor
+    within a `functools.cached_property`: Python 3.10 and 3.11 lock it for all instances.
     """
 
     def __init__(self, num: int = os.cpu_count() or 1, settings: CoresSettings = CoresSettings()) -> None:
@@ -123,7 +124,7 @@ class Cores:
             self.queue.append(place)
             self._admit()
         try:
-            while place not in self._held:
+            while not place.has_slot:
                 place.woken.wait(None if rank is Rank.HAND else self._settings.look)
                 place.woken.clear()
                 end_if(cancelled)
@@ -132,15 +133,16 @@ class Cores:
         finally:
             settle()
             with self._lock:
-                (self._held if place in self._held else self.queue).remove(place)
+                (self._held if place.has_slot else self.queue).remove(place)
                 if rank is Rank.HAND:
                     self._followed = time.monotonic()
                 self._admit()
                 self._left.notify_all()
 
     def wake(self, thread: int) -> None:
-        """Have a thread that waits for a slot, not for a hand's, ask at once whether that is still wanted."""
-        with self._lock:
+        """Have a thread that pauses, or waits for a slot but a hand's, ask at once whether that is still wanted."""
+        with self._left:
+            self._left.notify_all()
             for place in self.queue:
                 if place.thread == thread and place.rank is not Rank.HAND:
                     place.woken.set()
@@ -148,9 +150,10 @@ class Cores:
     def give_way(self, cancelled: Cancelled = never, place: _Place | None = None) -> None:
         """Pause where others come first, for `longest` at most; called at checkpoints, within a slot or not.
 
-        A refinement pauses while another slot is for something else. A thread whose account is overdrawn also pauses
-        between the frames of a drag, and while an account that owes less has a slot. Meanwhile its own slot, if it has
-        one, is free for what comes first.
+        A refinement pauses while something else than a refinement has a slot, or waits for one: threads of one
+        interpreter slow each other. A thread whose account is overdrawn also pauses between the frames of a drag, and
+        while an account that owes less has a slot. While a place pauses, its slot is lent to smaller ranks; who
+        borrows it keeps it, also where the pause ends first.
 
         Raises:
             UnwantedError: it is cancelled.
@@ -161,8 +164,9 @@ class Cores:
         longest = now + self._settings.longest if pauses else now
         with self._left:
             while now < longest and not cancelled():
-                others = [other for other in (self._held + self.queue if place else self._held) if other.thread != own]
-                come_first = any(
+                others = [other for other in self._held if other.thread != own]
+                borrow = place is not None and any(other.rank < place.rank for other in self.queue)
+                come_first = borrow or any(
                     other.rank is Rank.HAND or other.debt < debt or (refines and other.rank < Rank.REFINEMENT)
                     for other in others
                 )
@@ -227,10 +231,13 @@ class Cores:
             if place.rank is Rank.REFINEMENT and hands_wait and place is not due:
                 return
             follows = place.rank is Rank.HAND
-            taken = [(held.rank is Rank.HAND) == follows for held in self._held if not held.pauses or held < place]
-            if len(taken) < self._num and sum(taken) < self._most[follows]:
+            taken = [held for held in self._held if not held.pauses or held.rank <= place.rank]
+            same = sum((held.rank is Rank.HAND) == follows for held in taken)
+            rest = min(len(taken) - same, self._most[not follows])  # who has lent his slot may have gone on beside it
+            if same < self._most[follows] and same + rest < self._num:
                 self.queue.remove(place)
                 self._held.append(place)
+                place.has_slot = True
                 place.woken.set()
                 if place is due:
                     self._last_due = now

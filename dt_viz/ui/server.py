@@ -197,7 +197,8 @@ class Server:
         with self._lock:
             if self._closed or client.client_id not in self._server.get_clients():
                 return  # left before its turn came
-            came, is_full = time.monotonic(), self._share.num_visitors >= self.gate.limits.places
+            came = time.monotonic()
+            is_full = self._share.num_visitors + self._share.num_before(came) >= self.gate.limits.places
             said = client.gui.add_markdown(self._full(came)) if is_full else None
             self._waiting[client.client_id] = client, said, came
             self._tell()

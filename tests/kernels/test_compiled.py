@@ -83,6 +83,14 @@ def test_what_is_kept_of_a_kernel_is_its_machine_code_and_another_process_loads_
     assert functions and all(len(list(block.instructions)) == 1 for each in functions for block in each.blocks)
 
 
+def test_a_loaded_kernel_is_refused_where_compiled_code_calls_it(kept):
+    kept()
+    callee = short_kernel(twice)
+    assert (callee(2.0), loads(callee)) == (4.0, 1)
+    with pytest.raises(RuntimeError, match="unfit for linking"):
+        compiled.compiled(lambda x: callee(x) + 1)(2.0)
+
+
 def test_who_needs_a_kernel_waits_while_all_are_compiled_and_loads_it_then(kept):
     kernel, done = short_kernel(twice), threading.Event()
     thread = threading.Thread(target=lambda: (kernel(2.0), done.set()))

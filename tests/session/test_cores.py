@@ -10,6 +10,7 @@ import pytest
 from dt_viz.accounts import Account, QuotaSettings, charged
 from dt_viz.checkpoints import checked, checkpoint
 from dt_viz.errors import UnwantedError, never
+from dt_viz.session import cores as cores_module
 from dt_viz.session.cores import Cores, CoresSettings, Rank
 
 PATIENCE = 30
@@ -118,7 +119,7 @@ def test_who_has_waited_longest_comes_first_once_in_a_while(crowd):
         assert crowd.order == ["a", "B", "c", "1"]
 
 
-def test_a_hand_waits_no_longer_for_who_refines_because_that_one_has_waited_longest():
+def test_a_hand_has_its_slot_also_where_a_refinement_has_waited_longest():
     crowd = Crowd(2, 1, patience=0.0)
     for name in "aBcD":
         crowd.come(name)
@@ -392,6 +393,14 @@ def test_a_beginning_waits_for_one_slot_only_while_hands_wait_for_theirs():
         thread.join(PATIENCE)
 
 
+@pytest.fixture
+def usual_turn():
+    """Threads switch as before, after a test."""
+    before = sys.getswitchinterval()
+    yield before
+    sys.setswitchinterval(before)
+
+
 class Pausing:
     """A thread within a slot that calls checkpoints when it is told to; it notes that it has gone on after each."""
 
@@ -472,6 +481,125 @@ def test_a_slot_is_lent_to_one_only_and_is_taken_again():
     refines.end()
     assert others["a refinement"][0].wait(PATIENCE)
     others["a refinement"][1].set()
+
+
+@pytest.mark.parametrize("rank", [Rank.REFINEMENT, Rank.BEGINNING])
+def test_nobody_pauses_for_who_cannot_have_his_slot(rank):
+    """Such as one who overdraws while he refines, and another one who waits to refine, too."""
+    cores = Cores(2, CoresSettings(longest=10 * PATIENCE, least=0.0))
+    account, may_end = owing(0.0), threading.Event()
+    pausing = Pausing(cores, rank, account)
+    account.charge(5.0)
+    other = threading.Thread(target=lambda: refine_once(cores, may_end), daemon=True)
+    other.start()
+    while not cores.queue:
+        threading.Event().wait(0.001)
+    pausing.checkpoint()
+    assert pausing.went_on.wait(PATIENCE / 3)
+    pausing.end()
+    may_end.set()
+    other.join(PATIENCE)
+
+
+def test_a_refinement_lends_its_slot_to_no_refinement_that_owes_less():
+    cores, may_end = Cores(2, CoresSettings(longest=10 * PATIENCE)), threading.Event()
+    may_end.set()
+    pausing = Pausing(cores, Rank.REFINEMENT, owing(5.0))
+    with cores.slot():
+        pausing.checkpoint()
+        other = threading.Thread(target=lambda: refine_once(cores, may_end), daemon=True)
+        other.start()
+        other.join(0.3)
+        assert other.is_alive()
+    pausing.end()
+    other.join(PATIENCE)
+    assert not other.is_alive()
+
+
+def test_whoever_has_a_slot_knows_it_without_looking_through_a_list_that_others_change(monkeypatch):
+    """Else one who moves up in it while he looks may overlook himself, and wait for ever with the slot."""
+    cores, compared = Cores(2), []
+
+    def equal(place, other):
+        compared.append(cores._lock.locked())
+        return place is other
+
+    monkeypatch.setattr(cores_module._Place, "__eq__", equal)
+    with cores.slot(Rank.REFINEMENT), cores.slot():
+        pass
+    assert compared and all(compared)
+
+
+def refine_once(cores, may_end):
+    with cores.slot(Rank.REFINEMENT):
+        may_end.wait(PATIENCE)
+
+
+def test_a_hand_waits_for_hands_alone_also_where_a_slot_is_lent_and_the_lender_has_gone_on():
+    cores, may_end, has_slot = Cores(2, CoresSettings(longest=0.1)), threading.Event(), threading.Event()
+    refines = Pausing(cores)
+
+    def build():
+        with cores.slot(Rank.PAGE):
+            has_slot.set()
+            may_end.wait(PATIENCE)
+
+    page = threading.Thread(target=build, daemon=True)
+    page.start()
+    while not cores.queue:
+        threading.Event().wait(0.001)
+    refines.checkpoint()
+    assert has_slot.wait(PATIENCE) and refines.went_on.wait(PATIENCE)
+    followed = threading.Event()
+
+    def follow():
+        with cores.slot():
+            followed.set()
+
+    hand = threading.Thread(target=follow, daemon=True)
+    hand.start()
+    assert followed.wait(PATIENCE / 3)
+    may_end.set()
+    hand.join(PATIENCE)
+    page.join(PATIENCE)
+    refines.end()
+
+
+def test_who_pauses_and_is_not_wanted_any_more_ends_at_once_when_it_is_woken():
+    cores, unwanted, left = Cores(2, CoresSettings(longest=10 * PATIENCE)), threading.Event(), threading.Event()
+
+    def refine():
+        with suppress(UnwantedError), cores.slot(Rank.REFINEMENT, unwanted.is_set):
+            checkpoint()
+        left.set()
+
+    thread = threading.Thread(target=refine, daemon=True)
+    with cores.slot():
+        thread.start()
+        assert not left.wait(0.2)
+        unwanted.set()
+        assert thread.ident is not None
+        cores.wake(thread.ident)
+        assert left.wait(PATIENCE)
+
+
+def test_in_a_storm_of_all_ranks_and_checkpoints_nobody_waits_for_ever(usual_turn):
+    """Threads switch as often as they can, also while they look whether they have a slot."""
+    sys.setswitchinterval(1e-6)
+    cores, done = Cores(2, CoresSettings(longest=0.002)), []
+
+    def come(number):
+        for k in range(150):
+            with cores.slot(Rank((number + k) % 4)):
+                checkpoint()
+        done.append(number)
+
+    threads = [threading.Thread(target=come, args=(number,), daemon=True) for number in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(PATIENCE)
+    assert sorted(done) == list(range(8)) and not cores._held and not cores.queue
 
 
 def test_who_lends_his_slot_goes_on_after_a_while_also_beside_the_other():
