@@ -48,7 +48,7 @@ class Rank(IntEnum):
     BEGINNING = 1
     """The first picture of a page, a task or a scene: takes ten times as long."""
     PAGE = 2
-    """A part of a page that is built; it has no picture yet."""
+    """The building of half a page, which has no picture yet."""
     REFINEMENT = 3
 
 
@@ -90,7 +90,7 @@ class Cores:
         """Allow `num` computations at once."""
         self._lock, self._settings = threading.Lock(), settings
         self._left = threading.Condition(self._lock)
-        """Notified when somebody gives a slot back."""
+        """Notified when somebody gives a slot back, or is to ask at once whether his work is still wanted."""
         self._num, self._most = num, {True: settings.num_hands, False: max(1, num - 1)}
         """Number of slots, and of those of hands and of all else."""
         self.queue: list[_Place] = []
