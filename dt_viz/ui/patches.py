@@ -135,16 +135,22 @@ def report_failures(report: Callable[[BaseException], None]) -> None:
 
 
 class _Event(asyncio.Event):
-    """An event that is set by any thread, also while its loop wakes those who wait for it."""
+    """An event that only its own loop sets; another thread, which has the loop set it next, does nothing."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        super().__init__()
+        self._own = loop
 
     def set(self) -> None:
-        with suppress(RuntimeError):  # who waits is woken at this moment, by the loop
-            super().set()
+        with suppress(RuntimeError):  # no loop runs on this thread
+            if asyncio.get_running_loop() is self._own:
+                super().set()
 
 
 def tell_from_threads() -> None:
-    """Let any thread queue messages, which fails rarely: viser sets an event of asyncio, made for one thread.
+    """Let any thread queue messages: viser sets an event of asyncio, made for one thread, before its loop sets it.
 
+    Set by a thread just before the loop waits for it, the event is never set again, and the page stands still for ever.
     Hook: none is needed where viser does so on its loop alone.
     """
     buffer: Any = viser.infra._async_message_buffer.AsyncMessageBuffer
@@ -153,7 +159,7 @@ def tell_from_threads() -> None:
     @functools.wraps(original)
     def initialise(self: Any, *arguments: Any, **options: Any) -> None:  # noqa: ANN401
         original(self, *arguments, **options)
-        self.message_event = _Event()
+        self.message_event = _Event(self.event_loop)
 
     if not hasattr(original, "__wrapped__"):
         buffer.__init__ = initialise

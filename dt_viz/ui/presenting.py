@@ -115,6 +115,8 @@ class Lecture:
         self._lock = threading.RLock()  # viewers come and go in threads of their own
         self._viewers: dict[int, Viewer] = {}
         self._presenter: Presenter | None = None
+        self._absence = NOT_YET
+        """What viewers are told while there is no presenter."""
         self._headline = _line(NOT_YET)
         self._closed = threading.Event()
         patches.encode_once()
@@ -183,7 +185,7 @@ class Lecture:
         """Take the page of the presenter, which is built."""
         with self._lock:
             if self._presenter is not None and self._presenter.client is visitor.client:
-                self._presenter.visitor = visitor
+                self._presenter.visitor, self._absence = visitor, AWAY
 
     def farewell(self, client: viser.ClientHandle) -> None:
         """Forget somebody who has left."""
@@ -230,7 +232,7 @@ class Lecture:
         with self._lock:
             presenter, watching = self._presenter, [one for one in self._viewers.values() if one.line is not None]
             if presenter is None:
-                self._headline = _line(NOT_YET if self._headline == _line(NOT_YET) else AWAY)
+                self._headline = _line(self._absence)
             elif presenter.visitor is not None:
                 self._headline = presenter.visitor.headline
                 if (label := f"DT-Viz · {len(watching)} watching") != presenter.label:

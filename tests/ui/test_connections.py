@@ -5,11 +5,12 @@ import functools
 import logging
 import os
 import socket
+import sys
 import threading
 import time
 import urllib.error
 import urllib.request
-from contextlib import AsyncExitStack, asynccontextmanager, closing, contextmanager, nullcontext
+from contextlib import AsyncExitStack, asynccontextmanager, closing, contextmanager
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import get_type_hints
@@ -20,6 +21,7 @@ import pytest
 import viser  # noqa: TID251 - whose version the page has
 import websockets.sync.client
 from pages import wait_until
+from viser._messages import ResetGuiMessage  # noqa: TID251
 from viser.infra._async_message_buffer import AsyncMessageBuffer  # noqa: TID251
 from websockets.asyncio.client import connect
 from websockets.typing import Subprotocol
@@ -707,17 +709,36 @@ def test_who_comes_while_the_server_is_made_waits_for_it(monkeypatch, caplog):
 
 
 @asynchronous
-async def test_a_thread_may_tell_something_while_the_loop_wakes_who_waits(server, monkeypatch):
-    class Waking(list):
-        def __iter__(self):
-            raise RuntimeError("deque mutated during iteration")
+async def test_what_a_thread_tells_is_sent_also_just_before_the_loop_waits_for_it(server, monkeypatch):
+    loop = asyncio.get_running_loop()
+    buffer, new_future = AsyncMessageBuffer(loop, persistent_messages=False), loop.create_future
 
+    def create_future():
+        caller = sys._getframe(1)
+        if caller.f_code is asyncio.Event.wait.__code__ and caller.f_locals["self"] is buffer.message_event:
+            monkeypatch.undo()  # once: it has seen that the event is not set, and does not wait yet
+            thread = threading.Thread(target=buffer.push, args=(ResetGuiMessage(),))
+            thread.start()
+            thread.join()
+        return new_future()
+
+    monkeypatch.setattr(loop, "create_future", create_future)
+    windows = buffer.window_generator(0)
+    assert [type(message) for message in await asyncio.wait_for(anext(windows), PATIENCE)] == [ResetGuiMessage]
+    await windows.aclose()
+
+
+@asynchronous
+async def test_a_thread_wakes_nobody_itself_but_has_the_loop_do_so(server):
     buffer = AsyncMessageBuffer(asyncio.get_running_loop(), persistent_messages=False)
-    for event in (buffer.message_event, asyncio.Event()):
-        monkeypatch.setattr(event, "_waiters", Waking())
-        with nullcontext() if event is buffer.message_event else pytest.raises(RuntimeError):
-            event.set()
-        assert event.is_set()
+    thread = threading.Thread(target=buffer.push, args=(ResetGuiMessage(),))
+    thread.start()
+    thread.join()
+    assert not buffer.message_event.is_set()
+    await asyncio.wait_for(buffer.message_event.wait(), PATIENCE)
+    buffer.message_event.clear()
+    buffer.push(ResetGuiMessage())
+    assert buffer.message_event.is_set()
 
 
 def test_a_viser_with_other_messages_is_refused(monkeypatch):

@@ -77,7 +77,9 @@ def assert_sound(page: Page) -> None:
     for handle in page.inputs:
         value = handle.value
         if isinstance(handle, viser.GuiSliderHandle):
-            assert handle.min <= value <= max(handle.max, 20) and type(value) in (int, float)
+            assert type(value) in (int, float)
+            within = lambda slider=handle: slider.min <= slider.value <= max(slider.max, 20)  # noqa: E731
+            wait_until(within)  # a thread sets the limits of the timeline, and then its value
         elif isinstance(handle, viser.GuiDropdownHandle):
             assert value in handle.options
         elif isinstance(handle, viser.GuiCheckboxHandle):

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pages import wait_until
+from pages import ignored, wait_until
 from viser._messages import SetPositionMessage  # noqa: TID251
 from viser.infra import _infra  # noqa: TID251
 
@@ -158,6 +158,19 @@ async def test_before_anybody_presents_viewers_are_told_so(fits):
     with served(fits) as server:
         async with watching(f"ws://127.0.0.1:{server.port}") as early:
             assert early.says(NOT_YET) and not early.has_picture
+
+
+@pytest.mark.long
+@asynchronous
+async def test_who_has_presented_for_a_moment_is_missed(fits, monkeypatch):
+    with served(fits) as server:
+        url = f"ws://127.0.0.1:{server.port}"
+        async with watching(url) as viewer:
+            monkeypatch.setattr(presenting.Lecture, "_tell", ignored)  # not while he is there
+            async with presenting_at(url):
+                await come_true(lambda: server.visitors)
+            monkeypatch.undo()
+            assert await viewer.wait_for(lambda: viewer.says(AWAY), PATIENCE)
 
 
 @pytest.mark.long
