@@ -48,7 +48,7 @@ class Rank(IntEnum):
     BEGINNING = 1
     """The first picture of a page, a task or a scene: takes ten times as long."""
     PAGE = 2
-    """The building of half a page, which has no picture yet."""
+    """The building of a page, which has no picture yet."""
     REFINEMENT = 3
 
 
@@ -112,8 +112,8 @@ class Cores:
 
         Args:
             rank: what it is for.
-            cancelled: asked before it begins, while it waits unless it is for a hand, and of a refinement at each
-                `checkpoint` within the block.
+            cancelled: asked before it begins and, unless it is for a hand, while it waits and at each `checkpoint`
+                within the block.
 
         Raises:
             UnwantedError: it is cancelled; a checkpoint raises it, too.

@@ -15,6 +15,7 @@ from typing import NoReturn
 import viser
 
 from dt_viz.accounts import Accounts
+from dt_viz.errors import UnwantedError
 from dt_viz.learning.store import FitStore
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.saved import Saved
@@ -109,6 +110,7 @@ class Server:
             accounts.opened(self.gate.address(client)),
             begins,
             scenarios,
+            lambda: self._closed or client.client_id not in self._visitors,
         )
         self._lock = threading.Condition()
         self._visitors: dict[int, Visitor | None] = {}
@@ -261,6 +263,8 @@ class Server:
     def _build_page(self, client: viser.ClientHandle) -> None:
         try:
             visitor = self._new_visitor(client)
+        except UnwantedError:
+            return  # left while the page was to be built
         except Exception as error:
             logger.exception("the page of visitor %d could not be built", client.client_id)
             client.gui.add_markdown(f"**The page could not be built.** {type(error).__name__}: {error}")

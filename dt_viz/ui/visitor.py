@@ -113,12 +113,16 @@ class Visitor(Display):
         account: Account | None = None,
         begins: Saved | None = None,
         scenarios: Mapping[str, Saved] = MappingProxyType({}),
+        cancelled: Cancelled = never,
     ) -> None:
         """Build the page for an engine of its own and start computing; there is one arm where there are no `arms`.
 
         Where the browser keeps nothing, the page `begins` with a scenario, or else as the task does; a link may name
         one of the `scenarios`. Edits and pictures are counted in the `share` of this process, processor time in the
         visitor's `account`.
+
+        Raises:
+            UnwantedError: it is cancelled before the page is built.
         """
         self.client = client
         self.shown: Frame | None = None
@@ -127,16 +131,15 @@ class Visitor(Display):
         """Whether takes are seen that are not learned yet, and whether they are being learned."""
         self._dress(LIGHT)
         client.gui.set_panel_label("DT-Viz")
-        with CORES.slot(Rank.PAGE), client.atomic():
+        titled = {"": robot.title} if arms is None else arms.titles
+        self._keeper = Keeper(client.local_storage, known_names(titles, titled), self._made, begins)
+        self._exchanging = threading.RLock()  # the arm is moved, drawn, and shown or hidden, by different threads
+        with CORES.slot(Rank.PAGE, cancelled), client.atomic():
             self.pictures = ScenePictures(client.scene, robot, lambda: self.session)
             self.robot = RobotScene(client, robot, Playback(engine.arm, self._pose))
-        self._exchanging = threading.RLock()  # the arm is moved, drawn, and shown or hidden, by different threads
-        self._studio = Studio(self.pictures, lambda: self.robot, self._changing)
-        titled = {"": robot.title} if arms is None else arms.titles
-        pen = Pen(self.pictures, lambda: self.robot, lambda: self.session, self._face)
-        self._keeper = Keeper(client.local_storage, known_names(titles, titled), self._made, begins)
-        self._camera = CameraController(client, lambda: self.robot.hand, robot.size, self._keeper.changed)
-        with CORES.slot(Rank.PAGE), client.atomic():
+            self._studio = Studio(self.pictures, lambda: self.robot, self._changing)
+            pen = Pen(self.pictures, lambda: self.robot, lambda: self.session, self._face)
+            self._camera = CameraController(client, lambda: self.robot.hand, robot.size, self._keeper.changed)
             self._panel = ControlPanel(
                 client.gui,
                 titles,

@@ -412,14 +412,29 @@ async def test_a_page_is_built_before_anybody_refines_and_after_first_pictures(u
     monkeypatch.setattr(visitor_module, "CORES", cores)
     monkeypatch.setattr(cores, "slot", lambda rank=Rank.HAND, *more: (taken.append(rank), slot(rank, *more))[1])
     ask = keeping.Keeper._ask
-    monkeypatch.setattr(keeping.Keeper, "_ask", lambda keeper: (asked.append(len(cores._held)), ask(keeper))[1])
+    held = lambda: [place.rank for place in cores._held]  # noqa: E731
+    monkeypatch.setattr(keeping.Keeper, "_ask", lambda keeper: (asked.extend(held()), ask(keeper))[1])
     async with Client(url) as client:
         with slot(Rank.BEGINNING):
             await client.look()
             await come_true(lambda: cores.queue)
             assert not await client.wait_for(lambda: client.controls, 0.5)
         assert await client.wait_for(lambda: client.has_picture, PATIENCE)
-    assert (taken, asked) == ([Rank.PAGE, Rank.PAGE], [0])
+    assert (taken, asked) == ([Rank.PAGE], [Rank.BEGINNING])  # which is this test
+
+
+@asynchronous
+async def test_nobody_builds_the_page_of_who_has_left_while_it_waited(url, server, monkeypatch, caplog):
+    cores, built = Cores(2, CoresSettings(patience=10 * PATIENCE)), []
+    monkeypatch.setattr(visitor_module, "CORES", cores)
+    monkeypatch.setattr(visitor_module, "ScenePictures", lambda *_what: built.append(True))
+    with cores.slot(Rank.BEGINNING):
+        async with Client(url) as client:
+            await client.look()
+            await come_true(lambda: cores.queue)
+        await come_true(lambda: not cores.queue and not server._num_building)
+    assert not built and not server.visitors
+    assert not [record for record in caplog.records if record.levelno >= logging.ERROR]
 
 
 @asynchronous

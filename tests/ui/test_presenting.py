@@ -284,18 +284,18 @@ async def test_who_comes_later_with_the_key_takes_over_and_who_leaves_is_missed(
 @pytest.mark.long
 @asynchronous
 async def test_the_camera_follows_until_that_is_switched_off_and_again_from_then_on(url, server):
-    async def sees(place, guest):
+    async def sees(place, guest, seconds=PATIENCE):
         await presenter.look_from(place)
         pose = np.array(place), np.array(LOOK_AT)
         seen, _ = followed(pose, Framing(), CARD)
-        return await guest.wait_for(lambda: guest.cameras and np.allclose(guest.cameras[-1], seen, atol=0.02), 5)
+        return await guest.wait_for(lambda: guest.cameras and np.allclose(guest.cameras[-1], seen, atol=0.02), seconds)
 
     async with presenting_at(url) as presenter, watching(url) as viewer:
         viewer.cameras.clear()
         assert await sees((0.3, -2.0, 0.8), viewer)
         assert len(viewer.cameras) <= 2  # nothing where nothing moves
         await viewer.set(FOLLOW, False)
-        assert not await sees((0.9, -2.0, 0.9), viewer)
+        assert not await sees((0.9, -2.0, 0.9), viewer, 2.0)
         await viewer.set(FOLLOW, True)
         assert await sees((0.9, -2.0, 0.9), viewer)
         followed_last = viewer.cameras[-1]
@@ -303,7 +303,7 @@ async def test_the_camera_follows_until_that_is_switched_off_and_again_from_then
         await viewer.look_from((-0.5, -1.5, 0.6))
         viewer.cameras.clear()
         await viewer.set(FOLLOW, True)  # while the presenter's rests
-        assert await viewer.wait_for(lambda: viewer.cameras, 5)
+        assert await viewer.wait_for(lambda: viewer.cameras, PATIENCE)
         np.testing.assert_allclose(viewer.cameras[-1], followed_last, atol=1e-6)
 
 
