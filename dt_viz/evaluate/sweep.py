@@ -86,13 +86,16 @@ def sweep(options: argparse.Namespace, make: Callable[[], Shared]) -> Iterator[t
 
 
 def _swept(
-    parallel: Parallel, sweep: tuple[Any, ...], function: Callable[[Any, Any], Any], items: Iterable[Any]
+    parallel: Callable[[], Parallel], sweep: tuple[Any, ...], function: Callable[[Any, Any], Any], items: Iterable[Any]
 ) -> Iterator[Any]:
-    """Compute items by joblib, each within a tuple: arrays joblib would leave to one Dask worker, and lose with it."""
+    """Compute items by joblib, each within a tuple: arrays joblib would leave to one Dask worker, and lose with it.
+
+    What is told late of items that were given up, as another one failed, counts for a `Parallel` that nobody uses.
+    """
     from joblib import delayed  # noqa: PLC0415 - an extra
 
     try:
-        yield from parallel([delayed(_computed)((*sweep, function, item)) for item in items])
+        yield from parallel()([delayed(_computed)((*sweep, function, item)) for item in items])
     except BrokenExecutor as error:
         raise FormatError("--jobs", "a process that was ended, as for want of memory", "fewer") from error
 
@@ -118,19 +121,19 @@ def _threads() -> list[str | None]:
 
 
 @contextmanager
-def _processes(jobs: int) -> Iterator[Parallel]:
+def _processes(jobs: int) -> Iterator[Callable[[], Parallel]]:
     """Workers of this machine, which end with the sweep."""
     from joblib import Parallel  # noqa: PLC0415 - an extra
     from joblib.externals.loky import get_reusable_executor  # noqa: PLC0415
 
     try:
-        yield Parallel(jobs, "loky", max_nbytes=None, **SETTINGS)
+        yield partial(Parallel, jobs, "loky", max_nbytes=None, **SETTINGS)
     finally:
         get_reusable_executor(reuse=True).shutdown(wait=True, kill_workers=True)  # pyright: ignore[reportArgumentType]
 
 
 @contextmanager
-def _cluster(address: str) -> Iterator[Parallel]:
+def _cluster(address: str) -> Iterator[Callable[[], Parallel]]:
     """Workers of a Dask cluster."""
     from distributed import Client  # noqa: PLC0415 - an extra
     from joblib import Parallel  # noqa: PLC0415
@@ -142,7 +145,7 @@ def _cluster(address: str) -> Iterator[Parallel]:
             client.wait_for_workers(1, PATIENCE)
         except (OSError, asyncio.TimeoutError) as error:
             raise FormatError("--dask", f"{address!r}, which has no workers", CLUSTER) from error
-        yield Parallel(backend=_backend(client), **SETTINGS)
+        yield lambda: Parallel(backend=_backend(client), **SETTINGS)
 
 
 def _unanswered(address: str) -> Exception | None:

@@ -6,6 +6,7 @@ import signal
 import threading
 import time
 from argparse import Namespace
+from concurrent.futures import Future
 from typing import Any
 
 import numpy as np
@@ -154,6 +155,24 @@ def test_each_worker_computes_what_one_process_does_keeps_what_items_share_and_i
             list(swept(fail, range(2)))
         with pytest.raises(FormatError, match="--jobs: found a process that was ended"):
             list(swept(end, range(2)))
+
+
+@pytest.mark.long
+def test_what_is_told_late_of_items_that_were_given_up_does_not_end_the_next_ones(monkeypatch):
+    parallel = pytest.importorskip("joblib.parallel")
+    failed, before, begin = Future(), [], parallel.Parallel._initialize_backend
+    failed.set_exception(FormatError("--x", "2", "1"))
+
+    def begin_late(one):  # joblib does not abort any more by now, and does not yet know the calls apart
+        for other in before:
+            parallel.BatchCompletionCallBack(0.0, 1, other)(failed)
+        before.append(one)
+        return begin(one)
+
+    monkeypatch.setattr(parallel.Parallel, "_initialize_backend", begin_late)
+    with sweep(options(jobs=2), lambda: None) as (_, swept):
+        for _ in range(2):
+            assert [*swept(lambda _, k: k, range(3))] == [0, 1, 2]
 
 
 @pytest.mark.long
