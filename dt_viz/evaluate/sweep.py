@@ -90,7 +90,7 @@ def _swept(
 ) -> Iterator[Any]:
     """Compute items by joblib, each within a tuple: arrays joblib would leave to one Dask worker, and lose with it.
 
-    What is told late of items that were given up, as another one failed, counts for a `Parallel` that nobody uses.
+    Each call has a `Parallel` of its own: in one that is used again, an item of a call that failed may end the next.
     """
     from joblib import delayed  # noqa: PLC0415 - an extra
 

@@ -135,7 +135,7 @@ def report_failures(report: Callable[[BaseException], None]) -> None:
 
 
 class _Event(asyncio.Event):
-    """An event that only its own loop sets; another thread, which has the loop set it next, does nothing."""
+    """An event that only its own loop sets: in other threads `set` does nothing, as viser then has the loop set it."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         super().__init__()
@@ -148,10 +148,10 @@ class _Event(asyncio.Event):
 
 
 def tell_from_threads() -> None:
-    """Let any thread queue messages: viser sets an event of asyncio, made for one thread, before its loop sets it.
+    """Let any thread queue messages: viser sets an asyncio event in that thread, and once more in the loop.
 
-    Set by a thread just before the loop waits for it, the event is never set again, and the page stands still for ever.
-    Hook: none is needed where viser does so on its loop alone.
+    Where a thread sets it just before the loop waits for it, the loop sleeps, later calls of `set` do nothing as it is
+    set, and the page stands still for ever. Hook: none is needed where viser sets it in its loop alone.
     """
     buffer: Any = viser.infra._async_message_buffer.AsyncMessageBuffer
     original = buffer.__init__

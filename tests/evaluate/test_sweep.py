@@ -163,7 +163,7 @@ def test_what_is_told_late_of_items_that_were_given_up_does_not_end_the_next_one
     failed, before, begin = Future(), [], parallel.Parallel._initialize_backend
     failed.set_exception(FormatError("--x", "2", "1"))
 
-    def begin_late(one):  # joblib does not abort any more by now, and does not yet know the calls apart
+    def begin_late(one):  # joblib has forgotten that the call before was aborted, and has not yet named this one
         for other in before:
             parallel.BatchCompletionCallBack(0.0, 1, other)(failed)
         before.append(one)
