@@ -10,8 +10,8 @@ import numpy as np
 from dt_viz.kernels.arm import BODY_POINT
 from dt_viz.robot.body_points import PROTRUSION
 from dt_viz.robot.cover import CoverSettings, covering_tree
-from dt_viz.robot.meshes import LinkMesh
 from dt_viz.robot.models import load_jaco
+from dt_viz.robot.urdf import LinkMesh
 
 FILE = Path(__file__).parent / "body_points.npz"
 SETTINGS = CoverSettings(

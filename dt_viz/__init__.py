@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from dt_viz.library.motion import Motion, Path, fit
     from dt_viz.library.takes import example
     from dt_viz.motion.certificates import Certificates
-    from dt_viz.obstacles.shapes import Box, Cylinder, Sphere
-    from dt_viz.robot.tracking_settings import TrackingSettings
+    from dt_viz.obstacles.shapes import Box, Capsule, Cylinder, Sphere
+    from dt_viz.robot.robot import TrackingSettings
     from dt_viz.warning import MotionWarning
 
 __all__ = [
@@ -44,6 +44,7 @@ __all__ = [
     "BiasPoint",
     "BlockedError",
     "Box",
+    "Capsule",
     "Certificates",
     "Controller",
     "ControllerSettings",
@@ -88,10 +89,10 @@ _MODULES = {
     "library.motion": ("Motion", "Path", "fit"),
     "library.takes": ("example",),
     "motion.certificates": ("Certificates",),
-    "obstacles.shapes": ("Box", "Cylinder", "Sphere"),
+    "obstacles.shapes": ("Box", "Capsule", "Cylinder", "Sphere"),
     "avoidance.avoidance": ("ArmAvoidance",),
     "avoidance.hand": ("Avoidance", "HandAvoidance"),
-    "robot.tracking_settings": ("TrackingSettings",),
+    "robot.robot": ("TrackingSettings",),
     "avoidance.transform": ("Transform",),
     "avoidance.bias": ("BiasPoint",),
     "warning": ("MotionWarning",),

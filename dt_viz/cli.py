@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,8 +23,6 @@ from typing import IO, TYPE_CHECKING
 from dt_viz.arguments import Parser
 from dt_viz.evaluate.__main__ import main as evaluate
 from dt_viz.picture import main as picture
-from dt_viz.ui.logs import RateLimitFilter
-from dt_viz.ui.origins import Origin, OriginError
 
 if TYPE_CHECKING:
     from dt_viz.learning.store import FitStore
@@ -39,8 +37,7 @@ PROG = "dt-viz"
 MAX_PROCESSES, MOST_BY_DEFAULT = 64, 4
 """Largest number of processes that may be asked for, and that are taken unasked."""
 COMPILING = "Compiling for this processor, once"
-LOADED = 2.0
-"""Time, seconds, within which compiled code is loaded, so that nothing is said of it."""
+LOADED = 2.0  # time within which compiled code is loaded and no message comes, seconds
 MAX_SESSIONS, MAX_WATCHING = 8, 50
 """Largest numbers of visitors unless they are chosen: each with a private scene, and all with one."""
 MEASURE, PICTURE = "evaluate", "picture"
@@ -52,12 +49,9 @@ class _Offered:
     """What the server offers."""
 
     tasks: Mapping[str, TaskEntry]
-    first: str
-    """Name of the task that visitors begin with."""
-    begins: Saved | None
-    """Scenario that they begin with, if one is given."""
-    scenarios: Mapping[str, Saved]
-    """Scenarios that links may name."""
+    first: str  # name of the task that visitors begin with
+    begins: Saved | None  # scenario that they begin with, if one is given
+    scenarios: Mapping[str, Saved]  # scenarios that links may name
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -69,27 +63,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with _interruptible():
             if given and given[0] == PICTURE:
                 return picture(given[1:], prog=f"{PROG} {PICTURE}")
-            return _serve(_parser().parse_args(given))
+            return _serve(given)
     except KeyboardInterrupt:
         return 0
 
 
-def _serve(options: argparse.Namespace) -> int:
+def _serve(arguments: Sequence[str]) -> int:
+    # read when numpy is first imported, perhaps by an option: visitors share the cores, and BLAS threads cost them time
+    os.environ.update({"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"} | os.environ)
+    options = _parser().parse_args(arguments)
     if unused := _unused(options):
         print(f"{PROG}: {unused}", file=sys.stderr)
         return 2
-    # several visitors share the cores; BLAS threads for small matrices cost more than they gain
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # numerical libraries read these when they are first imported
     from dt_viz.errors import DataError, FormatError  # noqa: PLC0415
     from dt_viz.folders import default_cache_folder  # noqa: PLC0415
-    from dt_viz.kernels.compiled import is_complete  # noqa: PLC0415
+    from dt_viz.kernels.compiled import compiling_elsewhere, is_complete  # noqa: PLC0415
     from dt_viz.learning.imitation import ImitationError  # noqa: PLC0415
     from dt_viz.learning.store import FitStore  # noqa: PLC0415
-    from dt_viz.serving.board import Board, own_share  # noqa: PLC0415
-    from dt_viz.serving.listening import AddressError, listen  # noqa: PLC0415
-    from dt_viz.serving.supervisor import Supervisor  # noqa: PLC0415
+    from dt_viz.serving.board import Share  # noqa: PLC0415
+    from dt_viz.serving.supervisor import AddressError, Supervisor, listen  # noqa: PLC0415
+    from dt_viz.ui.gate import RateLimitFilter  # noqa: PLC0415
     from dt_viz.ui.server import MAX_WAITING, Server  # noqa: PLC0415
 
     handler = logging.StreamHandler()
@@ -141,11 +134,11 @@ def _serve(options: argparse.Namespace) -> int:
     num_processes, num_connections = 1 if key else _num_processes(options.processes), max_sessions + MAX_WAITING
     if num_processes > 1 and is_complete():
         _compile(robot, threading.Event())  # processes that are forked from this one have it then, too
-    with listening:
+    with compiling_elsewhere(), listening:
+        share = Share(num_processes, num_connections)
         if num_processes == 1:
-            return _work(new_server, prepare, own_share(num_connections), listening, ready)
-        work = partial(_work, new_server, prepare)
-        return Supervisor(listening, Board(num_processes, num_connections), work, ready).run()
+            return _work(new_server, prepare, share, listening, ready)
+        return Supervisor(listening, share, partial(_work, new_server, prepare), ready).run()
 
 
 def _offered(options: argparse.Namespace, robot: Robot) -> _Offered:
@@ -238,8 +231,10 @@ def _work(
     ready: Callable[[], None] = lambda: None,
 ) -> int:
     """Serve in this process until it is interrupted; return the exit status where it cannot begin."""
+    from dt_viz.folders import remove_abandoned  # noqa: PLC0415
     from dt_viz.ui.patches import GateError  # noqa: PLC0415
 
+    remove_abandoned()
     try:
         server = new_server(listening, share)
     except GateError as error:
@@ -410,10 +405,12 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _origin(text: str) -> Origin:
+def _origin(text: str) -> str:
+    from dt_viz.ui.gate import origin_of  # noqa: PLC0415 - imports numpy
+
     try:
-        return Origin.parse(text)
-    except OriginError as error:
+        return origin_of(text)
+    except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from error
 
 
@@ -458,11 +455,12 @@ class _Bar:
 
 
 def _prepare(fits: FitStore, task: Task, robot: Robot, share: Share, leaving: threading.Event) -> None:
-    """Learn the first task and compile what a drag repeats, beside the server, which answers meanwhile.
+    """Compile the kernels that a drag calls and learn the first task, while the server answers.
 
-    The first process does so for all; the others find it on disk.
+    The first process does so for all; the others find both on disk.
     """
     from dt_viz.errors import UnwantedError  # noqa: PLC0415
+    from dt_viz.kernels.compiled import READY  # noqa: PLC0415
     from dt_viz.learning.imitation import ImitationError  # noqa: PLC0415
     from dt_viz.learning.state import has_orientations  # noqa: PLC0415
 
@@ -473,49 +471,42 @@ def _prepare(fits: FitStore, task: Task, robot: Robot, share: Share, leaving: th
             raise UnwantedError
         bar(fraction, message)
 
-    while not share.may_prepare:
-        if leaving.wait(0.1):
-            return
     try:
+        while not share.may_prepare:
+            if leaving.wait(0.1):
+                return
+        _compile_elsewhere(leaving)
+        READY.set()
         if task.imitation is None and not has_orientations(task.demonstrations):  # else it is learned in milliseconds
             fits.get(task.demonstrations, progress=progress)
-        _compile_elsewhere(leaving)
         _compile(robot, leaving)
         share.prepared()
     except UnwantedError:
         pass
     except ImitationError as error:
         print(f"{PROG}: {error}", file=sys.stderr)
+    finally:
+        READY.set()
 
 
 def _compile_elsewhere(leaving: threading.Event) -> None:
-    """Compile what a drag repeats, unless it is kept, in two processes: a compiler's memory is freed only with them.
-
-    One begins with the first kernel, the other with the last; each loads what the other has compiled.
-    """
+    """Compile all kernels, unless they are cached, in a process: a compiler's memory is freed only with its process."""
     from dt_viz.files.processes import start_module  # noqa: PLC0415
-    from dt_viz.kernels.compiled import compiling_all  # noqa: PLC0415
+    from dt_viz.kernels.compiled import is_wanted  # noqa: PLC0415
 
-    bar, parts = _Bar(COMPILING), dict[str, float]()
+    if not is_wanted():
+        return
+    bar = _Bar(COMPILING)
 
-    def follow(order: str, told: IO[bytes]) -> None:
-        for line in told:
-            before, parts[order] = sum(parts.values()), float(line)
-            if before < 1:
-                bar(min(sum(parts.values()), 1.0))
+    def follow(fractions: IO[bytes]) -> None:
+        for line in fractions:
+            bar(float(line))
 
-    with compiling_all() as wanted, ExitStack() as stack:
-        if not wanted:
-            return
-        processes = list[subprocess.Popen[bytes]]()
-        for order in ("forwards", "backwards")[: os.cpu_count()]:
-            process = start_module("dt_viz.avoidance", order, given=subprocess.PIPE, output=subprocess.PIPE)
-            processes.append(stack.enter_context(process))
-            threading.Thread(target=follow, args=(order, process.stdout)).start()
-        while any(process.poll() is None for process in processes):
+    with start_module("dt_viz.avoidance", given=subprocess.PIPE, output=subprocess.PIPE) as process:
+        threading.Thread(target=follow, args=(process.stdout,)).start()
+        while process.poll() is None:
             if leaving.wait(0.1):
-                for process in processes:
-                    process.kill()
+                process.kill()
 
 
 def _compile(robot: Robot, leaving: threading.Event) -> None:

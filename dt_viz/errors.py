@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-Cancelled = Callable[[], bool]
-"""Tells whether nobody wants any more what is being computed."""
+Cancelled = Callable[[], bool]  # returns whether the result is not wanted any more
 
 
 class UnwantedError(Exception):

@@ -2,14 +2,29 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 from collections import defaultdict
 from collections.abc import Callable, Hashable
 from functools import wraps
-from typing import Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 _Result = TypeVar("_Result")
 _Method = TypeVar("_Method", bound=Callable[..., Any])
+
+
+class cached_property(functools.cached_property[_Result]):
+    """`functools.cached_property` without its lock, which Python 3.10 and 3.11 hold for all instances.
+
+    Several threads may ask. Where two compute the same value at once, both get the one that was there first.
+    """
+
+    if not TYPE_CHECKING:  # its types are those of the base class
+
+        def __get__(self, instance: object, owner: type | None = None) -> object:
+            if instance is None:
+                return self
+            return vars(instance).setdefault(self.attrname, self.func(instance))
 
 
 class Memo:

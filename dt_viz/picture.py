@@ -16,8 +16,7 @@ from pathlib import Path
 
 from dt_viz.arguments import Parser
 
-OF = ("motion", "turntable", "warp")
-"""What a video shows."""
+OF = ("motion", "turntable", "warp")  # what a video shows
 
 
 def main(arguments: Sequence[str], prog: str) -> int:

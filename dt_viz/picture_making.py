@@ -9,19 +9,18 @@ import re
 import shutil
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
-from dt_viz.errors import DataError, FormatError, never
+from dt_viz.errors import DataError, FormatError
 from dt_viz.files.npz import write_whole
-from dt_viz.folders import default_cache_folder
+from dt_viz.folders import TemporaryFolder, default_cache_folder
 from dt_viz.learning.imitation import ImitationError
 from dt_viz.learning.store import FitStore
-from dt_viz.motion.following import Follower
 from dt_viz.pictures import figures, video
 from dt_viz.robot.models import load_jaco
 from dt_viz.robot.robot import Robot
@@ -31,44 +30,25 @@ from dt_viz.scenario.saved import Saved
 from dt_viz.scenario.tasks import TASKS, TaskEntry
 from dt_viz.scenario.tour import STEPS, TASK
 from dt_viz.session.arms import ArmStore
-from dt_viz.session.frame import Frame, Stage
+from dt_viz.session.frame import Stage
 from dt_viz.session.session import CHOICES
-from dt_viz.ui.scene.figure import SUFFIXES, render_figure
-from dt_viz.ui.scene.recording import record
+from dt_viz.ui.scene.export import FORMATS, Order
+from dt_viz.ui.scene.figure import SUFFIXES
+from dt_viz.ui.scene.recording import drawn
 from dt_viz.ui.server import Server
 from dt_viz.ui.visitor import initial, known_names, pose_of
 
-BAD_INPUT = 2
-"""Exit status for what the user can put right; argparse uses the same."""
-
-
-@dataclass(frozen=True)
-class PictureSettings:
-    """What pictures may be, and how a browser makes them."""
-
-    browsers: tuple[str, ...] = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-    """Commands that are looked for, the first that there is is taken."""
-    arguments: tuple[str, ...] = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--mute-audio")
-    """Arguments with which a browser draws by software, without a screen."""
-    variable: str = "DT_VIZ_CHROMIUM"
-    """Name of the environment variable that names another browser."""
-    smallest: int = 64
-    """Smallest width and height, pixels."""
-    largest: int = 7680
-    """Largest width and height, pixels."""
-    largest_video: int = 1920
-    """Largest width and height of a video, pixels."""
-    window: int = 1920
-    """Largest width and height of the browser's window, pixels: the picture may be larger."""
-    patience: float = 300.0
-    """Longest time to wait for each of the page, its motion and the picture, seconds."""
-    drawing: float = 4.0
-    """Time that a browser takes for letters and surfaces once it has all that is drawn, seconds."""
-    along: float = 0.45
-    """Part of its motion at which the arm is shown."""
-
-
-SETTINGS = PictureSettings()
+BAD_INPUT = 2  # exit status for what the user can put right; argparse uses the same
+BROWSERS = "chromium", "chromium-browser", "google-chrome", "google-chrome-stable"
+"""Commands that are looked for; the first that there is is taken."""
+BY_SOFTWARE = "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--mute-audio"
+"""Arguments with which a browser draws without a screen."""
+VARIABLE = "DT_VIZ_CHROMIUM"  # name of the environment variable that names another browser
+SMALLEST, LARGEST, LARGEST_VIDEO = 64, 7680, 1920  # width and height of a picture, and of a video, pixels
+WINDOW = 1920  # largest width and height of the browser's window, pixels: the picture may be larger
+PATIENCE = 300.0  # longest time to wait for the page, and for its motion, seconds
+DRAWING = 4.0  # time that a browser takes for letters and surfaces once it has all that is drawn, seconds
+ALONG = 0.45  # part of its motion at which the arm is shown
 
 
 def make(options: argparse.Namespace, prog: str) -> int:
@@ -86,32 +66,31 @@ def make(options: argparse.Namespace, prog: str) -> int:
 
 def _maker(out: Path, size: str | None, of: str) -> Callable[[Saved], bytes]:
     """Return what makes a file of this kind; raises FormatError before anything is computed where nothing can."""
-    suffixes = ".png", *SUFFIXES, ".html", *video.VIDEO_SUFFIXES
-    if out.suffix not in suffixes:
-        raise FormatError("--out", repr(str(out)), f"a file that ends in {', '.join(suffixes)}")
+    if out.suffix not in FORMATS:
+        raise FormatError("--out", repr(str(out)), f"a file that ends in {', '.join(FORMATS)}")
     if not out.absolute().parent.is_dir() or out.is_dir():
         raise FormatError("--out", repr(str(out)), "a file in a folder that exists")
     if out.suffix in SUFFIXES:
         figures.check_installed()
-        return lambda saved: render_figure(_computed(saved, Stage.FINE)[0], out.suffix)
-    if out.suffix == ".html":
-        return lambda saved: record(*_computed(saved, Stage.CERTIFIED), pose_of(saved.camera))
+    if out.suffix in (*SUFFIXES, ".html"):
+        return partial(_drawn, suffix=out.suffix)
     is_video = out.suffix in video.VIDEO_SUFFIXES
     size = size or ("1280x720" if is_video else "1920x1080")
     found = re.fullmatch(r"(\d{1,9})x(\d{1,9})", size)
     width, height = (int(number) for number in found.groups()) if found else (0, 0)
-    largest, even = (SETTINGS.largest_video, "even, ") if is_video else (SETTINGS.largest, "")
+    largest, even = (LARGEST_VIDEO, "even, ") if is_video else (LARGEST, "")
     odd = is_video and (width % 2 or height % 2)
-    if odd or not SETTINGS.smallest <= min(width, height) <= max(width, height) <= largest:
-        raise FormatError("--size", repr(size), f"WIDTHxHEIGHT, each {even}{SETTINGS.smallest} to {largest}")
+    if odd or not SMALLEST <= min(width, height) <= max(width, height) <= largest:
+        raise FormatError("--size", repr(size), f"WIDTHxHEIGHT, each {even}{SMALLEST} to {largest}")
     if is_video:
-        video.check_installed()
-    given = os.environ.get(SETTINGS.variable)
-    browser = next(filter(None, map(shutil.which, (given,) if given else SETTINGS.browsers)), None)
+        video.ffmpeg()
+    given = os.environ.get(VARIABLE)
+    browser = next(filter(None, map(shutil.which, (given,) if given else BROWSERS)), None)
     if browser is None:
-        accepted = f"one of {', '.join(SETTINGS.browsers)}, or its path in {SETTINGS.variable} (or --out with .svg)"
+        accepted = f"one of {', '.join(BROWSERS)}, or its path in {VARIABLE} (or --out with .svg)"
         raise FormatError("Chromium", repr(given) if given else "none installed", accepted)
-    return lambda saved: _rendered(saved, (width, height), browser, out.suffix, of)
+    order = Order(out.suffix, (width, height), what=of.title(), alone=True)
+    return partial(_rendered, order=order, browser=browser)
 
 
 def _chosen(name: str) -> Saved:
@@ -142,17 +121,19 @@ def _given() -> tuple[Mapping[str, TaskEntry], FitStore, Robot]:
     return TASKS, FitStore(default_cache_folder()), load_jaco()
 
 
-def _computed(saved: Saved, stage: Stage) -> tuple[Frame, Follower]:
-    """Compute the frame of a scenario at a stage; return what follows it, too."""
+def _drawn(saved: Saved, suffix: str) -> bytes:
+    """Compute a scenario, and draw it without a browser."""
     scenario, engine = saved.scenario, ArmStore(*_given()).engine(saved.scenario.arm)
     if saved.own is not None:
-        own, _gone = engine.bring(saved.own.task, "")
+        own, _gone = engine.bring(saved.own.task, scenario.arm)
         scenario = replace(scenario, task=own.name)
-    return next(frame for frame in engine.frames(scenario) if frame.stage is stage), engine.follower
+    stage = Stage.FINE if suffix in SUFFIXES else Stage.CERTIFIED
+    frame = next(frame for frame in engine.frames(scenario) if frame.stage is stage)
+    return drawn(frame, suffix, engine.follower, pose_of(saved.camera))
 
 
-def _rendered(saved: Saved, size: tuple[int, int], browser: str, suffix: str, of: str) -> bytes:
-    """Have a browser render a scenario, its arm in the middle of its motion, as the page saves it; or a video `of` it.
+def _rendered(saved: Saved, order: Order, browser: str) -> bytes:
+    """Have a browser render a scenario as the page saves it, its arm in the middle of its motion, or a video of it.
 
     Raises:
         FormatError: it is no browser, and ends.
@@ -162,9 +143,9 @@ def _rendered(saved: Saved, size: tuple[int, int], browser: str, suffix: str, of
     at_rest = replace(saved, scenario=replace(scenario, view=replace(scenario.view, playing=False)))
     first = scenario.task if scenario.task in TASKS else next(iter(TASKS))
     server = Server(*_given(), task=first, port=0, begins=at_rest)
-    shrunk = min(1.0, SETTINGS.window / max(size))
+    shrunk = min(1.0, WINDOW / max(order.size))
     try:
-        window = tuple(round(shrunk * side) for side in size)
+        window = tuple(round(shrunk * side) for side in order.size)
         with _opened(browser, f"http://{server.host}:{server.port}", window) as process:
             _until(lambda: bool(server.visitors) or process.poll() is not None, f"{browser} to open the page")
             if not server.visitors:
@@ -172,22 +153,17 @@ def _rendered(saved: Saved, size: tuple[int, int], browser: str, suffix: str, of
             visitor = server.visitors[0]
             session = visitor.session
             _until(lambda: session.jobs.wait_idle(CHOICES, 0.1) and session.wait_idle(0.1), "the motion")
-            frame = visitor.shown
-            wanted = replace(scenario.choices, task="")
-            if (
-                frame is None
-                or frame.stage is not Stage.CERTIFIED
-                or replace(frame.scenario.choices, task="", passing=None) != wanted
-            ):
+            frame, wanted = visitor.shown, replace(scenario.choices, task="")
+            choices = None if frame is None else replace(frame.scenario.choices, task="", passing=None)
+            if frame is None or frame.stage is not Stage.CERTIFIED or choices != wanted:
                 raise TimeoutError(f"the page shows no motion of {scenario.task}")
             if frame.arm is not None:
-                visitor.robot.playback.live.put(frame.arm.q[round(SETTINGS.along * (len(frame.arm.q) - 1))])
-            least = SETTINGS.smallest
-            visitor.render_alone((least, least), SETTINGS.patience)  # the browser then has all that was sent
-            time.sleep(SETTINGS.drawing)
-            if suffix == ".png":
-                return visitor.render_alone(size, SETTINGS.patience, saved.camera)
-            return visitor.film(of.title(), suffix, size, lambda _part: None, never, alone=True)
+                visitor.robot.playback.live.put(frame.arm.q[round(ALONG * (len(frame.arm.q) - 1))])
+            visitor.robot.playback.advance(0.0)
+            visitor.client.flush()
+            visitor.picture(Order(".png", (SMALLEST, SMALLEST), alone=True))  # the browser then has all that was sent
+            time.sleep(DRAWING)
+            return visitor.picture(order._replace(sight=saved.camera) if order.suffix == ".png" else order)
     finally:
         server.close()
 
@@ -196,9 +172,9 @@ def _rendered(saved: Saved, size: tuple[int, int], browser: str, suffix: str, of
 def _opened(browser: str, address: str, window: tuple[int, ...]) -> Iterator[subprocess.Popen[bytes]]:
     """Open a page in a browser of its own, without a screen, and close it in the end."""
     sandbox = ("--no-sandbox",) if hasattr(os, "geteuid") and os.geteuid() == 0 else ()
-    with tempfile.TemporaryDirectory(prefix="dt-viz-", ignore_cleanup_errors=True) as profile:
+    with TemporaryFolder() as profile:
         own = (f"--user-data-dir={profile}", "--remote-debugging-port=0", f"--window-size={window[0]},{window[1]}")
-        command = (browser, "--headless", *SETTINGS.arguments, *sandbox, *own, address)
+        command = (browser, "--headless", *BY_SOFTWARE, *sandbox, *own, address)
         with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
             try:
                 yield process
@@ -207,8 +183,8 @@ def _opened(browser: str, address: str, window: tuple[int, ...]) -> Iterator[sub
 
 
 def _until(condition: Callable[[], bool], what: str) -> None:
-    deadline = time.monotonic() + SETTINGS.patience
+    deadline = time.monotonic() + PATIENCE
     while not condition():
         if time.monotonic() > deadline:
-            raise TimeoutError(f"waited for {SETTINGS.patience:g} s in vain for {what}")
+            raise TimeoutError(f"waited for {PATIENCE:g} s in vain for {what}")
         time.sleep(0.05)

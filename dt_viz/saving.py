@@ -25,9 +25,9 @@ from dt_viz.avoidance import registry
 from dt_viz.avoidance.avoidance import SPACES, Avoidance
 from dt_viz.avoidance.transform import Transform
 from dt_viz.errors import Cancelled, DataError, FormatError, check_between, naming, parsing
-from dt_viz.files.checks import read_bytes
-from dt_viz.files.npz import Archive, arrays_of, check_types, npz_bytes, write_whole
-from dt_viz.files.uploads import read_upload
+from dt_viz.files.checks import check_at_most, read_bytes
+from dt_viz.files.npz import MAX_ARRAYS, Archive, arrays_of, check_types, npz_bytes, write_whole
+from dt_viz.files.reading import read_upload
 from dt_viz.files.values import CLASS, packed, unpacked
 from dt_viz.learning.augmented import AugmentedImitation, fit_augmented
 from dt_viz.learning.demonstrations import MAX_COORDINATE, Demonstration, check_demonstrations
@@ -48,16 +48,14 @@ from dt_viz.scenario.tasks import OWN, TASKS, Task, own_task
 FORMAT = 1
 """Version of the file; raised where files from before cannot be read any more, also by a change of the imitation's
 arrays. A new field that has a default does not need that."""
-MAX_BYTES = 40 * 10**6
-"""Largest number of bytes of a file, and of what it unpacks to."""
-KNOWN = Known(tuple(TASKS), arms=None, methods=None)
-"""What scenarios may name."""
-MAX_SCENARIOS = 100
-"""Largest number of scenarios that a server offers."""
+MAX_BYTES = 40 * 10**6  # largest number of bytes of a file, and of what it unpacks to
+MAX_TEXT, MAX_LAYERS = 3 * 10**6, 100
+"""Largest numbers of characters of the text, and of layers: a thousand demonstrations have up to 2 million."""
+KNOWN = Known(tuple(TASKS), arms=None, methods=None)  # what scenarios may name
+MAX_SCENARIOS = 100  # largest number of scenarios that a server offers
 TEXT, LEARNED = "motion", "imitation."
 """Name of the array that holds the text, and prefix of those of the imitation."""
-FIRST = f"{TEXT}.npy".encode()
-"""Name of a file's first member."""
+FIRST = f"{TEXT}.npy".encode()  # name of a file's first member
 
 
 class MotionError(DataError):
@@ -69,15 +67,12 @@ class SavedMotion:
     """What a motion is made of."""
 
     demonstrations: tuple[Demonstration, ...]
-    layers: tuple[Layer, ...]
-    """The transforms on the imitation, from the inside out."""
+    layers: tuple[Layer, ...]  # the transforms on the imitation, from the inside out
     augmented: bool = False
     """Whether it was learned in the augmented state: then it is learned again from the demonstrations when it is
     read, which takes milliseconds; by another version of DT-Viz perhaps otherwise."""
-    labels: tuple[float, ...] | None = None
-    """Labels of the demonstrations, of the augmented state."""
-    reason: str = ""
-    """Why it was learned in the augmented state, if nobody asked for that."""
+    labels: tuple[float, ...] | None = None  # labels of the demonstrations, of the augmented state
+    reason: str = ""  # why it was learned in the augmented state where none was chosen
     settings: AugmentedSettings = field(default_factory=AugmentedSettings)
     """Settings of the augmented state."""
     inspections: tuple[Inspection, ...] = ()
@@ -224,7 +219,7 @@ def read_motion(content: bytes, source: str | Path) -> tuple[SavedMotion, AnyImi
         DataError: as :func:`load_motion`.
     """
     with parsing(MotionError, source, "file", "a file that Motion.save wrote"):
-        return _read(arrays_of(content, max_bytes=MAX_BYTES), source)
+        return _read(arrays_of(content, max_bytes=MAX_BYTES, max_arrays=MAX_ARRAYS), source)
 
 
 def _read(
@@ -240,12 +235,14 @@ def _read(
     text = arrays.pop(TEXT, np.zeros(0))
     if text.dtype.kind != "U" or text.ndim:
         raise FormatError("arrays", "no text that describes a motion", "a file that Motion.save wrote")
+    check_at_most("text", text.itemsize // 4, MAX_TEXT, "characters")
     plain = json.loads(str(text), object_hook=_from_before)
     json.dumps(plain, ensure_ascii=False).encode()  # fails at half a character, which nothing could show
     version = plain.pop("version", None) if isinstance(plain, dict) else None
     if version != FORMAT:
         raise FormatError("version", repr(version)[:40], f"{FORMAT}; another version of DT-Viz may have saved it")
     check_types(arrays)
+    check_at_most("layers", len(plain.get("layers", ())), MAX_LAYERS)
     classes = {Transform: registry.KINDS, Obstacle: SHAPES}
     motion: SavedMotion = unpacked(plain, SavedMotion, "motion", arrays, classes)
     learned = {name.removeprefix(LEARNED): array for name, array in arrays.items() if name.startswith(LEARNED)}

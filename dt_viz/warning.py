@@ -6,21 +6,16 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum, auto
 
-ARM = "Arm"
-"""Source of warnings about the shown arm, which are left out while it is hidden."""
+ARM = "Arm"  # source of warnings about the shown arm, which are left out while it is hidden
 
 
 class Severity(Enum):
     """Gravity of a result, or of a message."""
 
-    GOOD = auto()
-    """Every check is made, and holds."""
-    NOTE = auto()
-    """The warp is on its way, so that the checks say nothing."""
-    WARNING = auto()
-    """Something is not as it should be."""
-    ALARM = auto()
-    """There is a collision, or no motion."""
+    GOOD = auto()  # every check is made, and holds
+    NOTE = auto()  # the warp is on its way, so that the checks say nothing
+    WARNING = auto()  # something is not as it should be
+    ALARM = auto()  # there is a collision, or no motion
 
 
 class Concern(Enum):
@@ -49,12 +44,9 @@ class Concern(Enum):
 class Mend(Enum):
     """Remedy of a problem."""
 
-    INTEGRATION = auto()
-    """The automatic choice of the integrator, instead of one by hand."""
-    FLOW = auto()
-    """Another flow of the avoidance, or its being switched on."""
-    WHOLE_ARM = auto()
-    """Avoidance by the whole arm."""
+    INTEGRATION = auto()  # the automatic choice of the integrator, instead of one by hand
+    FLOW = auto()  # another flow of the avoidance, or its being switched on
+    WHOLE_ARM = auto()  # avoidance by the whole arm
 
 
 class Kind(Enum):
@@ -79,35 +71,26 @@ class Kind(Enum):
         """Whether it is about collisions of the meshes of the arm that is shown."""
         return self in {Kind.ARM_ENTERS, Kind.ARM_HITS_ITSELF, Kind.ARM_BELOW_TABLE}
 
-    IMITATION = Concern.CAUTION
-    """The demonstrations were not learned as they are."""
+    IMITATION = Concern.CAUTION  # the demonstrations were not learned as they are
     START_COVERED = Concern.CAUTION
     GOAL_COVERED = Concern.CAUTION
-    STAYS_INSIDE = Concern.COLLISION, Mend.FLOW
-    """No flow time leads a motion out of an obstacle."""
+    STAYS_INSIDE = Concern.COLLISION, Mend.FLOW  # no flow time leads a motion out of an obstacle
     ENTERS = Concern.COLLISION, Mend.FLOW, "STAYS_INSIDE"
-    TOO_NEAR = Concern.TOO_CLOSE, Mend.FLOW
-    """A motion keeps less than the margin from an obstacle."""
+    TOO_NEAR = Concern.TOO_CLOSE, Mend.FLOW  # a motion keeps less than the margin from an obstacle
     GOAL_MISSED = Concern.CAUTION, None, "GOAL_COVERED"
-    MISPLACED = Concern.CAUTION
-    """A transform stands at a place where it has no effect."""
+    MISPLACED = Concern.CAUTION  # a transform stands at a place where it has no effect
     OFF_PLANE = Concern.CAUTION
     """A bias point of a drawing lies before or behind the drawing's plane."""
-    UNREACHED = Concern.CAUTION
-    """A transform does not lead every motion to its place."""
+    UNREACHED = Concern.CAUTION  # a transform does not lead every motion to its place
     TARGET_MISSED = Concern.CAUTION
     """A motion gives way to an obstacle and passes beside a bias point."""
-    UNSAMPLED = Concern.INEXACT
-    """The motions are stretched too far to be drawn exactly."""
+    UNSAMPLED = Concern.INEXACT  # the motions are stretched too far to be drawn exactly
     OUT_OF_REACH = Concern.CAUTION
-    PATH_MISSED = Concern.CAUTION
-    """The joints do not lead the hand along its path."""
-    HAND_TURNED = Concern.CAUTION
-    """The joints do not turn the hand as the motion does."""
+    PATH_MISSED = Concern.CAUTION  # the joints do not lead the hand along its path
+    HAND_TURNED = Concern.CAUTION  # the joints do not turn the hand as the motion does
     NO_WAY = Concern.CAUTION
     """The arm, free at its ends, finds no motion between them that does not touch an obstacle."""
-    ARM_BLOCKED = Concern.CAUTION
-    """The arm finds no way around an obstacle."""
+    ARM_BLOCKED = Concern.CAUTION  # the arm finds no way around an obstacle
     ROLLOUT_ENTERS = Concern.COLLISION, Mend.FLOW
     """The arm, avoiding as a whole, enters an obstacle on some rollout."""
     ARM_TOO_NEAR = Concern.TOO_CLOSE, Mend.FLOW
@@ -116,20 +99,15 @@ class Kind(Enum):
     """The arm that is shown enters an obstacle."""
     ARM_HITS_ITSELF = Concern.TOO_CLOSE
     ARM_BELOW_TABLE = Concern.COLLISION
-    DAMPED = Concern.CAUTION
-    """The pseudo-inverse of the arm's Jacobian is damped."""
+    DAMPED = Concern.CAUTION  # the pseudo-inverse of the arm's Jacobian is damped
     FOLDS = Concern.INEXACT, Mend.INTEGRATION
     """A step of an integrator that was chosen by hand folds space."""
     INEXACT_INVERSE = Concern.INEXACT, Mend.INTEGRATION
     """An integrator that was chosen by hand does not come back to where it began."""
-    NO_DIFFEOMORPHISM = Concern.INEXACT, None, "FOLDS"
-    """det J is not positive."""
-    ROUND_TRIP = Concern.INEXACT, None, "INEXACT_INVERSE"
-    """ψ⁻¹(ψ(y)) is not y."""
-    NOT_FALLING = Concern.INEXACT, None, "FOLDS"
-    """The Lyapunov value does not fall."""
-    OFF_MOTION = Concern.INEXACT
-    """The shown motion is no image of the base motion."""
+    NO_DIFFEOMORPHISM = Concern.INEXACT, None, "FOLDS"  # det J is not positive
+    ROUND_TRIP = Concern.INEXACT, None, "INEXACT_INVERSE"  # ψ⁻¹(ψ(y)) is not y
+    NOT_FALLING = Concern.INEXACT, None, "FOLDS"  # the Lyapunov value does not fall
+    OFF_MOTION = Concern.INEXACT  # the shown motion is no image of the base motion
 
 
 @dataclass(frozen=True)

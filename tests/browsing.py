@@ -67,8 +67,7 @@ DROP = """files => {
 STORED = "Object.keys(localStorage).find(key => key.endsWith('dt-viz'))"
 """Script that finds the name under which the browser keeps what was made on the page."""
 
-PHONE = (390, 844)
-"""Width and height of the window of a phone, CSS pixels."""
+PHONE = (390, 844)  # width and height of the window of a phone, CSS pixels
 BOX = """element => {
     const {left, top, right, bottom} = element.getBoundingClientRect();
     const seen = [Math.max(left, 0), Math.max(top, 0), Math.min(right, innerWidth), Math.min(bottom, innerHeight)];
@@ -86,8 +85,7 @@ BOX = """element => {
 }"""
 """An element's box, the part of it that nothing around it cuts off, and whether its own content is wider than it."""
 
-page_errors: list[str] = []
-"""What pages have complained of in their consoles."""
+page_errors: list[str] = []  # what pages have complained of in their consoles
 OF_OTHERS = ("Unable to preventDefault inside passive event listener", "GPU stall due to ReadPixels")
 """Said by viser's own page of any drag, and by Chromium where it draws by software; nothing is lost."""
 
@@ -160,21 +158,6 @@ def kept(page) -> str | None:
 def press(locator):
     """Click without waiting for two alike pictures of the page, which may be long in coming."""
     locator.click(force=True)
-
-
-def click_at(page, bar, part, done, what):
-    """Click at a part of a slider's bar until that is done: the bar may still be on its way, or covered by a notice."""
-    wait_until(lambda: bar.bounding_box() is not None, f"the bar of {what}")
-    for _ in range(TRIES):
-        close_notices(page)
-        box = bar.bounding_box()
-        page.mouse.click(box["x"] + part * box["width"], box["y"] + box["height"] / 2)
-        deadline = time.monotonic() + PATIENCE / TRIES
-        while time.monotonic() < deadline:
-            if done():
-                return
-            time.sleep(0.05)
-    pytest.fail(f"{TRIES} clicks in vain for {what}")
 
 
 def travel(page, name):

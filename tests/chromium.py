@@ -11,6 +11,6 @@ ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftsh
 """Arguments with which it draws by software, without a screen."""
 
 needs_chromium = pytest.mark.skipif(
-    CHROMIUM is None and "DT_VIZ_REQUIRE_BROWSER" not in os.environ,
+    CHROMIUM is None,
     reason="no Chromium on this machine (Debian: apt-get install chromium)",
 )

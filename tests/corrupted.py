@@ -10,8 +10,7 @@ from dt_viz.flows.fields import Array
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.metrics import interpolate
 
-NOISE = 0.003
-"""Standard deviation of each coordinate, metres; amplitude of the tremor."""
+NOISE = 0.003  # standard deviation of each coordinate, metres; amplitude of the tremor
 Corrupt = Callable[[Array, Array, np.random.Generator], tuple[Array, Array]]
 
 

@@ -30,8 +30,7 @@ from dt_viz.session.frame import Stage
 FOLDER = Path(__file__).parent / "frozen"
 DESCRIPTIONS = json.loads((FOLDER / "scenarios.json").read_text(encoding="utf-8"))
 FITS, ROLLOUTS = FOLDER / "fits.npz", FOLDER / "rollouts.npz"
-NUM_KEPT = 15
-"""Number of samples that are kept of each path."""
+NUM_KEPT = 15  # number of samples that are kept of each path
 
 
 class StoredFits(FitStore):

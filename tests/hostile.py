@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from functools import cache
+from multiprocessing import forkserver
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -31,14 +32,14 @@ from dt_viz import saving
 from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.avoidance.hand import Avoidance
 from dt_viz.errors import DataError, never, parsing
-from dt_viz.files import uploads
+from dt_viz.files.reading import read_upload
 from dt_viz.files.recordings import Recordings
 from dt_viz.flows.diffeomorphisms import Integration
 from dt_viz.learning import demonstrations as demos
 from dt_viz.learning.imitation import ImitationSettings, fit
 from dt_viz.obstacles import clouds, solids
 from dt_viz.obstacles import files as shapes
-from dt_viz.obstacles.learned_maps import solid_map, unit_map
+from dt_viz.obstacles.occupancy import solid_map, unit_map
 from dt_viz.obstacles.shapes import ORIGIN, Box, CloudObstacle, Cylinder, MeshObstacle, Sphere
 from dt_viz.saving import SavedMotion, save_motion
 from dt_viz.scenario.own import Own
@@ -46,12 +47,9 @@ from dt_viz.scenario.saved import Known, Saved, check_shapes, decode, encode
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.tasks import OWN, TASKS, own_task
 
-PROCESS = Path("/proc/self")
-"""What Linux says of this process."""
-MAX_ADDRESS_SPACE = 4 * 2**30
-"""Of the program: what goes beyond ends it before the machine suffers."""
-MAX_SECONDS = 300
-"""After which a file ends the program."""
+PROCESS = Path("/proc/self")  # what Linux says of this process
+MAX_ADDRESS_SPACE = 4 * 2**30  # of the program: what goes beyond ends it before the machine suffers
+MAX_SECONDS = 300  # after which a file ends the program
 NUMBERS = (0, 1, -1, 2, 255, 65535, 2**31 - 1, 2**31, 2**32 - 1, 2**63, -(2**63), 10**12)
 WORDS = ("", "0", "-1", "nan", "-inf", "1e308", "-1e308", "1e-320", "999999999999", "9" * 400, "0x10", "1_0", "\u0661")
 VALUES = (None, True, -1, 0, 1, 3, 2**31, 2**63, 1e308, -0.5, "", "x" * 1000, [], {}, [[[]]], [0] * 1000)
@@ -304,6 +302,23 @@ def saved_scenario() -> bytes:
     return encode(Saved(Scenario(OWN, stack), own=own)).encode()
 
 
+def with_learned(num: int = 2, **arrays: np.ndarray) -> Own:
+    """Demonstrations, and what was learned of one elsewhere, some arrays of it changed."""
+    s = np.linspace(0, 1, 20)
+    given = tuple(demos.Demonstration(2 * s, np.stack([s - 1, s * (1 - s)], axis=1), f"arc {k}") for k in range(num))
+    imitation = fit(given[:1], ImitationSettings(num_layers=2, num_points=12, max_iterations=2))
+    own = Own.of(replace(own_task(demos.check_demonstrations(given, "test")), imitation=imitation, state="plain"))
+    assert own.learned is not None
+    return replace(own, learned={**own.learned, **arrays})
+
+
+def flow_of(counts: tuple[int, int], steps: int, number: int = 0) -> dict[str, np.ndarray]:
+    """The arrays of a flow with so many Gaussians along each axis, which moves points by next to nothing."""
+    axes = {f"layer_{number}_axis_{j}": np.linspace(-1.0, 1.0, counts[j]) for j in range(2)}
+    own = {"weights": np.full((counts[0] * counts[1], 2), 1e-12), "ell_steps_forward": np.array([1.0, steps, 0.0])}
+    return {**axes, **{f"layer_{number}_{name}": array for name, array in own.items()}}
+
+
 def with_changed_json(content: bytes, rng: Rng) -> bytes:
     """With other values in it, if it still is JSON."""
     try:
@@ -400,7 +415,7 @@ def read(kind: str, name: str, content: bytes) -> None:
         return
     if kind == "takes":
         with parsing(DataError, name, "file", "recorded motions"):
-            given = uploads.read_upload(Recordings, [(name, content)], answers={}, joint_names=["joint1", "joint2"])
+            given = read_upload(Recordings, [(name, content)], answers={}, joint_names=["joint1", "joint2"])
         assert all(np.isfinite(take.values).all() and np.isfinite(take.times).all() for take in given.takes)
         return
     if kind == "motion":
@@ -445,10 +460,9 @@ def main() -> None:
 
     unit_map(Sphere(ORIGIN, 2.0)).logit(np.zeros((1, 3)))  # compiling is not reading
     resource.setrlimit(resource.RLIMIT_AS, (MAX_ADDRESS_SPACE, MAX_ADDRESS_SPACE))
-    uploads.keep_ready(main)
     with coarsely() if "--coarse" in sys.argv else nullcontext():
         read_what_is_given()
-    uploads.let_go(main)
+    forkserver._forkserver._stop()  # pyright: ignore[reportAttributeAccessIssue] - its processes are counted then
     print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024, flush=True)
 
 
@@ -457,10 +471,10 @@ def read_what_is_given() -> None:
 
     def seconds() -> float:
         both = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-        ready = uploads._ready._process
-        ticks = [0] if ready is None else PROCESS.with_name(f"{ready._process.pid}").joinpath("stat").read_text()
+        server = forkserver._forkserver._forkserver_pid  # pyright: ignore[reportAttributeAccessIssue]
+        ticks = [0] if server is None else PROCESS.with_name(f"{server}").joinpath("stat").read_text()
         ticks = ticks.rpartition(")")[2].split()[11:15] if isinstance(ticks, str) else ticks
-        waiting = sum(map(int, ticks)) / os.sysconf("SC_CLK_TCK")  # of the process that reads, which goes on
+        waiting = sum(map(int, ticks)) / os.sysconf("SC_CLK_TCK")  # of the forkserver and the processes that it forked
         return sum(used.ru_utime + used.ru_stime for used in both) + waiting
 
     def megabytes(name: str) -> float:

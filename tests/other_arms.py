@@ -10,8 +10,7 @@ from dt_viz.robot.body_points import BodyPoints
 from dt_viz.robot.models import load_jaco
 from dt_viz.robot.robot import Robot
 
-MORE = 3
-"""Index of the joint that is inserted."""
+MORE = 3  # index of the joint that is inserted
 
 
 @lru_cache(maxsize=1)

@@ -2,13 +2,16 @@
 
 import asyncio
 import contextlib
+import functools
+import io
 import time
-from dataclasses import dataclass, fields, replace
-from types import SimpleNamespace
+from dataclasses import fields, make_dataclass, replace
+from types import MappingProxyType, SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import viser  # noqa: TID251 - a page that no browser shows
+from PIL import Image
 from scenes import biases, changed, starts_at
 from viser import _messages as messages  # noqa: TID251
 from viser._gui_handles import GuiProgressBarHandle  # noqa: TID251
@@ -21,14 +24,14 @@ from dt_viz.obstacles.shapes import Box, Cylinder, Sphere, rotation
 from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.tasks import TASKS
+from dt_viz.scheduler import Jobs
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Frame, Stage
-from dt_viz.session.jobs import Jobs
 from dt_viz.session.robot_loop import LiveArm
 from dt_viz.session.session import Session
-from dt_viz.ui.bindings import EDITS, Bindings
-from dt_viz.ui.controls import Control
+from dt_viz.ui.bindings import EDITS, Bindings, Control
 from dt_viz.ui.panel import ControlPanel
+from dt_viz.ui.playback import LANE as ARM
 from dt_viz.ui.scene.camera import HOME, CameraController, Framing, view_of, window_size
 from dt_viz.ui.tabs.opening import CHOOSING
 from dt_viz.ui.visitor import Visitor
@@ -37,8 +40,7 @@ from dt_viz.warning import Severity
 MIDDLE = (0.1, -0.5, 0.4)
 TITLES = {name: entry.title for name, entry in TASKS.items()}
 CLIENT = cast(Any, 0)
-PATIENCE = 30.0
-"""Seconds after which a test gives up; nothing on a page takes that long."""
+PATIENCE = 30.0  # seconds after which a test gives up; nothing on a page takes that long
 
 
 def ignored(*_what: Any) -> Any:
@@ -50,6 +52,21 @@ def wait_until(condition: Any, patience: float = PATIENCE) -> None:
     while not condition():
         assert time.monotonic() < deadline, "waited in vain"
         time.sleep(0.01)
+
+
+async def come_true(condition: Any) -> None:
+    """Wait on an event loop: the machine may be busy."""
+    await asyncio.to_thread(wait_until, condition, 90.0)
+
+
+def asynchronous(test: Any) -> Any:
+    """Runs a test on an event loop, for three minutes at most."""
+
+    @functools.wraps(test)
+    def run(**fixtures: Any) -> None:
+        asyncio.run(asyncio.wait_for(test(**fixtures), 180.0))
+
+    return run
 
 
 def all_of(scenario: Scenario) -> dict[str, Any]:
@@ -66,27 +83,13 @@ def painted_at(image: Any, half_size: Any, seen: Any) -> np.ndarray:
     return image.position + rotation((w, x, y, z)) @ [*np.multiply(half_size, across), 0.0]
 
 
-@dataclass(frozen=True, eq=False)
-class FrameWithoutMotion(Frame):
-    """A frame that is given what others take from their motion."""
-
-    task: Any = None
-    ghost: Any = ()
-    rollouts: Any = ()
-    times: Any = ()
-    levels: Any = ()
-    level: Any = None
-    goal: Any = None
-    reached: Any = None
-    shaping: Any = ()
-    chosen: Any = 0
-    remembers: Any = False
-    has_orientation: Any = False
-    reason: Any = ""
-    labels: Any = ()
-    learned_steps: Any = ()
-    durations: Any = None
-    chosen_values: Any = None
+GIVEN: dict[str, Any] = dict.fromkeys(("task", "level", "goal", "reached", "durations", "chosen_values"))
+GIVEN |= dict.fromkeys(("ghost", "rollouts", "times", "levels", "shaping", "labels", "learned_steps"), ())
+GIVEN |= {"chosen": 0, "remembers": False, "has_orientation": False, "reason": ""}
+FrameWithoutMotion: Any = make_dataclass(
+    "FrameWithoutMotion", [(name, Any, value) for name, value in GIVEN.items()], bases=(Frame,), frozen=True, eq=False
+)
+"""A frame that is given what others take from their motion."""
 
 
 def frame_of(scenario: Scenario, **changes: Any) -> Frame:
@@ -166,6 +169,35 @@ class NoFrames:
         return iter(())
 
 
+class Answers:
+    """The connection of a page that answers what it is to render by the `get_render` of its client, as a PNG."""
+
+    def __init__(self, client: Any) -> None:
+        self._client, self.handlers = client, []
+
+    def register_handler(self, _kind: Any, handler: Any) -> None:
+        self.handlers.append(handler)
+
+    def unregister_handler(self, _kind: Any, handler: Any) -> None:
+        self.handlers.remove(handler)
+
+    def queue_message(self, asked: Any) -> None:
+        shot = {name: getattr(asked, name) for name in ("wxyz", "position", "fov")}
+        answer = self._client.get_render(asked.height, asked.width, **shot)
+        self.answer(asked.render_uuid, answer if isinstance(answer, bytes) else png_of(answer))
+
+    def answer(self, uuid: str, payload: bytes) -> None:
+        for handler in [*self.handlers]:
+            handler(self._client.client_id, messages.GetRenderResponseMessage(payload, uuid))
+
+
+def png_of(rgba: Any) -> bytes:
+    """A PNG of pixels (height, width, 4)."""
+    file = io.BytesIO()
+    Image.fromarray(rgba, "RGBA").save(file, "PNG")
+    return file.getvalue()
+
+
 class Page:
     """A visitor's page on a server that nobody looks at, and what a browser may send to it."""
 
@@ -183,9 +215,11 @@ class Page:
             atomic=contextlib.nullcontext,
             flush=lambda: None,
             add_notification=lambda *_what, **_how: None,
-            get_render=lambda *_size, **_how: np.zeros((2, 2, 4), np.uint8),
+            get_render=lambda height, width, **_how: np.zeros((height, width, 4), np.uint8),
             send_file_download=lambda *_what, **_how: None,
         )
+        self.client._websock_connection = Answers(self.client)
+        self.client._viser_server = SimpleNamespace(flush=lambda: None, get_clients=lambda: {0: self.client})
         self.gui._resolve_client = lambda _id: self.client  # type: ignore[method-assign]
         self.scene._get_client_handle = lambda _id: self.client  # type: ignore[method-assign]
         engine = cast(Engine, NoFrames())
@@ -277,6 +311,10 @@ class Page:
         """Wait until the work of buttons is done."""
         assert self.session.jobs.wait_idle(EDITS, PATIENCE)
 
+    def settle(self) -> None:
+        """Wait until nothing is done any more but that the arm moves."""
+        wait_until(lambda: {*self.session.jobs._lanes} <= {ARM})
+
     def begin(self, scenario: Scenario) -> None:
         self.session.edit("test", **all_of(scenario))
 
@@ -328,10 +366,11 @@ class Bound(Bindings):
 class Edited:
     """A session that keeps the scenario of its edits, and shows it on a panel if there is one."""
 
+    taught: Any = MappingProxyType({})
+
     def __init__(self, scenario: Scenario, panel: Any = None) -> None:
         self.scenario, self.task, self._panel = scenario, TASKS[scenario.task](), panel
-        self.steps = 0
-        """For undo."""
+        self.steps = 0  # for undo
         self.said: list[tuple[str, Severity]] = []
         self.jobs = Jobs(lambda error: self.say(str(error), Severity.ALARM))
         self._adopt()

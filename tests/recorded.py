@@ -1,6 +1,8 @@
 """Recorded motions in files of each kind, written by the libraries that usually write them."""
 
+import io
 import json
+import zipfile
 from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,8 +16,7 @@ from dt_viz.learning.demonstrations import load_demonstrations
 
 TIMES = 0.02 * np.arange(60)
 RNG = np.random.default_rng(1)
-ANGLES = np.column_stack([np.linspace(0, 1, 60), np.linspace(1, -0.5, 60)])
-"""Of two joints."""
+ANGLES = np.column_stack([np.linspace(0, 1, 60), np.linspace(1, -0.5, 60)])  # of two joints
 
 
 class Planar:
@@ -49,6 +50,15 @@ def wxyz(turns):
 def table(names, columns, delimiter=","):
     rows = [delimiter.join(f"{value!r}" for value in map(float, row)) for row in np.column_stack(columns)]
     return "\n".join([delimiter.join(names), *rows]).encode()
+
+
+def zipped(files, compression=zipfile.ZIP_STORED):
+    """An archive of files."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", compression) as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+    return file.getvalue()
 
 
 def read_demonstrations(content, name, **options):

@@ -11,10 +11,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from demo import PATIENCE, address, started
+from protocol_client import LostError, ProtocolClient
 
-from dt_viz import cli
 from dt_viz.cli import main
-from dt_viz.evaluate.protocol_client import LostError, ProtocolClient
 from dt_viz.learning import store
 from dt_viz.scenario.own import Own
 from dt_viz.scenario.saved import Saved, encode
@@ -102,24 +101,12 @@ def test_own_files_are_the_task_that_the_page_begins_with(monkeypatch, tmp_path,
         path = np.stack([300 * s, 100 * s**2 + 10 * k, 200 - 50 * s], axis=1)
         np.savetxt(tmp_path / f"{k}.csv", path, delimiter=",", header="x,y,z", comments="")
 
-    def serve(tasks, _fits, robot, *_where, task, max_of_address, **_how):
-        assert max_of_address == 40
-        assert robot.name == "jaco"
-        shown = tasks[task]()
-        assert (task, shown.title, len(shown.paths)) == ("own_data", "Own data", 2)
-        assert {*TASKS} < {*tasks}
-        np.testing.assert_allclose(shown.paths[0][-1], [0.3, 0.1, 0.15])
-        assert shown.demonstrations[0].duration == pytest.approx(59 / 30)
-        raise GateError("it would be ready")
-
-    monkeypatch.setattr(server, "Server", serve)
-    assert (
-        main(
-            [str(tmp_path), "--rate", "30", "--unit", "mm", "--max-of-address", "40", "--port", "0", "--processes", "1"]
-        )
-        == 2
-    )
-    assert "it would be ready" in capsys.readouterr().err
+    given, said = served(monkeypatch, capsys, tmp_path, "--rate", 30, "--unit", "mm", "--max-of-address", 40)
+    assert "it would be ready" in said and given["max_of_address"] == 40 and {*TASKS} < {*given["tasks"]}
+    shown = given["tasks"][given["task"]]()
+    assert (given["task"], shown.title, len(shown.paths)) == ("own_data", "Own data", 2)
+    np.testing.assert_allclose(shown.paths[0][-1], [0.3, 0.1, 0.15])
+    assert shown.demonstrations[0].duration == pytest.approx(59 / 30)
     assert main([str(tmp_path), "--columns", "x,y"]) == 2
     assert "0.csv: columns: found 2 names for 3 columns; accepted: 3 names" in capsys.readouterr().err
 
@@ -208,40 +195,10 @@ def test_a_folder_without_scenarios_or_with_very_many_is_refused(tmp_path, capsy
     assert said in capsys.readouterr().err
 
 
-def test_handlers_of_signals_are_as_before_when_it_returns(capsys):
-    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
-    assert main(["--task", "nothing"]) == 2
-    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
-    assert "found 'nothing'" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(("processes", "kept", "loads"), [("2", True, 1), ("2", False, 0), ("1", True, 0)])
-def test_several_processes_share_the_compiled_code_that_is_kept(monkeypatch, processes, kept, loads):
-    """What the supervisor loads before it forks, a process that takes a dead one's place has at once."""
-    loaded = []
-    monkeypatch.setattr("dt_viz.kernels.compiled.is_complete", lambda: kept)
-    monkeypatch.setattr(cli, "_compile", lambda *_what: loaded.append(True))
-    monkeypatch.setattr(cli, "_work", lambda *_what: 0)
-    monkeypatch.setattr("dt_viz.serving.supervisor.Supervisor.run", lambda _supervisor: 0)
-    assert main(["--port", "0", "--processes", processes]) == 0
-    assert len(loaded) == loads
-
-
 def test_the_key_of_the_presenter_is_printed_and_another_one_each_time(monkeypatch, capsys):
-    started = []
-
-    def serve(*_what, **how):
-        started.append(how)
-        raise GateError("it would be ready")
-
-    monkeypatch.setattr(server, "Server", serve)
-    for _ in range(2):
-        main(["--present", "--port", "0"])
-    main(["--port", "0", "--processes", "1"])
-    one, other, private = started
+    one, other, private = (served(monkeypatch, capsys, *given)[0] for given in (["--present"], ["--present"], []))
     assert len(one["key"]) > 20 and one["key"] != other["key"] and private["key"] is None
     assert (one["max_sessions"], private["max_sessions"]) == (50, 8)
-    assert "it would be ready" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -249,6 +206,7 @@ def test_the_key_of_the_presenter_is_printed_and_another_one_each_time(monkeypat
     [
         ("--help", 0, "dt-viz evaluate --help"),
         ("evaluate around --task nothing --out a.npz", 2, "dt-viz evaluate around: --task: found 'nothing'"),
+        ("--task nothing", 2, "found 'nothing'"),
         ("--arm pr2", 2, "name: found 'pr2'; accepted: jaco, panda, ur3"),
         ("--urdf nowhere.urdf", 2, "nowhere.urdf: file: found No such file"),
         ("--arm panda --home=0,1 --srdf x", 2, "--home, --srdf: found without --urdf; accepted: with --urdf"),
@@ -264,11 +222,13 @@ def test_the_key_of_the_presenter_is_printed_and_another_one_each_time(monkeypat
     ],
 )
 def test_it_explains_itself_and_what_is_wrong_and_measurements_are_a_subcommand(capsys, arguments, status, words):
+    handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     try:
         ended = main(arguments.split())
     except SystemExit as exit:
         ended = exit.code
     assert ended == status
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers  # as before
     written = capsys.readouterr()
     assert words in written.out + written.err
     assert written.err.count("\n") <= 1  # what is accepted, not all that there is

@@ -10,16 +10,17 @@ from pathlib import Path
 
 import pytest
 
+from assets import train_baselines
 from dt_viz.cli import PROG, main
 from dt_viz.evaluate.__main__ import COMMANDS
 from dt_viz.evaluate.__main__ import main as evaluate
 from tests.benchmarks import __main__ as benchmarks
+from tests.benchmarks import documents as tables
 
 ROOT = Path(__file__).parents[1]
 PARTS = ("dt_viz", "assets", "docs")
 DOCUMENTS = [*ROOT.glob("*.md"), *(page for part in PARTS for page in ROOT.glob(f"{part}/**/*.md"))]
-DOCKERFILE = ROOT / "assets/serving/Dockerfile"
-PROGRAMS = {f"{PROG} ": main, f"{benchmarks.PROG} ": benchmarks.main}
+PROGRAMS = {f"{PROG} ": main, f"{benchmarks.PROG} ": benchmarks.main, f"{train_baselines.PROG} ": train_baselines.main}
 MEASUREMENTS = dict.fromkeys(COMMANDS, evaluate) | dict.fromkeys(benchmarks.NAMES, benchmarks.main)
 """Programs whose names the tables of measurements leave out, by the name of what is measured."""
 QUICK = re.compile(r"picture [\w-]+ --out \S+\.(svg|pdf|html)")
@@ -69,6 +70,12 @@ def test_programs_take_the_commands_of_the_documents(monkeypatch):
     assert len(TOLD) > 30 and len(RUN) > 1
 
 
+@pytest.mark.parametrize("document", tables.DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_the_tables_of_a_document_are_those_of_the_sitting_that_is_kept(document):
+    text = document.read_text(encoding="utf-8")
+    assert text == tables.filled(text)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("command", RUN)
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of matplotlib's own parts
@@ -78,27 +85,3 @@ def test_quick_commands_make_what_they_say(command, tmp_path, monkeypatch):
     assert main(shlex.split(command)) == 0
     (made,) = tmp_path.iterdir()
     assert command.endswith(f" --out {made.name}") and made.stat().st_size > 10_000
-
-
-def extras(text):
-    """Names of extras that a text says to install."""
-    found = re.findall(r"""["'](?:dt-viz|\.)\[([\w,]+)\]["']|extra `\[(\w+)\]`""", text)
-    return {name for both in found for names in both for name in names.split(",") if name}
-
-
-def test_extras_that_are_told_of_are_the_packages_and_the_container_has_those_of_the_page():
-    project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
-    (table,) = re.findall(r"^\[project\.optional-dependencies\]\n((?:\w.*\n)+)", project, re.MULTILINE)
-    told = set().union(*(extras(document.read_text(encoding="utf-8")) for document in DOCUMENTS))
-    assert {"data", "video", "docs"} <= told <= set(re.findall(r"^\w+", table, re.MULTILINE))
-    assert extras(DOCKERFILE.read_text(encoding="utf-8")) == {"figures", "video", "metrics", "data"}
-
-
-@pytest.mark.parametrize(
-    "command", ["dt-viz --no-such-option", "dt-viz --arm", "dt-viz picture fig-4", "load --visitor"]
-)
-def test_a_command_that_is_wrong_is_noticed(command):
-    ((run, arguments),) = commands(f"    {command}   # as it was called once")
-    with pytest.raises(SystemExit) as ended:
-        run(arguments)
-    assert ended.value.code == 2

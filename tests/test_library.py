@@ -143,21 +143,6 @@ def test_a_covered_goal_of_a_drawing_is_left_in_the_plane(letter):
     assert abs(box.signed_distance(end)) < 2e-3 and 0.04 < np.linalg.norm(around.goal - letter.goal) < 0.07
 
 
-@pytest.mark.long
-def test_transforms_are_stacked_in_any_order(letter):
-    x, y = middle_of(letter)
-    target = (float(x) + 0.05, float(y) + 0.04, 0.0)
-    ball = dt.Sphere((float(x) - 0.06, float(y), 0.0), diameter=0.06)
-    for stacked in (
-        letter.stack(dt.BiasPoint(target), dt.Avoidance(ball)),
-        letter.stack(dt.Avoidance(ball)).stack(dt.BiasPoint(target)),
-    ):
-        paths = [path.positions for path in stacked.rollouts()]
-        assert max(np.linalg.norm(path - target[:2], axis=1).min() for path in paths) < 0.015
-        assert min(ball.signed_distance(np.pad(path, ((0, 0), (0, 1)))).min() for path in paths) > 0
-    assert len(letter.transforms) == 0  # stacking changes nothing of what it was called on
-
-
 def test_the_velocity_field_is_that_of_the_paths(push):
     around = push.stack(dt.Avoidance(BALL))
     rng = np.random.default_rng(0)

@@ -79,9 +79,7 @@ class TestResampling:
     def test_spaces_points_equally_on_a_bent_line(self):
         path = np.array([[0.0, 0], [0.1, 0], [0.1, 0], [1, 0], [1, 1]])
         np.testing.assert_allclose(resample_by_arc_length(path, 5), [[0, 0], [0.5, 0], [1, 0], [1, 0.5], [1, 1]])
-
-    def test_a_path_of_one_place_stays_there(self):
-        np.testing.assert_array_equal(resample_by_arc_length(np.ones((4, 2)), 3), np.ones((3, 2)))
+        np.testing.assert_array_equal(resample_by_arc_length(np.ones((4, 2)), 3), np.ones((3, 2)))  # stays there
 
 
 class TestDiscreteFrechet:
@@ -124,38 +122,16 @@ def test_the_jerk_is_the_third_derivative():
     assert rms_jerk(np.array([0.0, 0.1]), np.eye(2), 0.05) == 0  # too short to tell
 
 
-class TestRmsAtEqualTimes:
-    def test_of_a_constant_offset_is_its_length(self):
-        times = np.linspace(0, 1, 7)
-        path = np.stack([times, times**2], axis=1)
-        assert rms_at_equal_times(times, path, times, path + np.array([0.3, 0.4])) == pytest.approx(0.5)
-
-    def test_does_not_depend_on_extra_samples_of_the_motion(self):
-        times, fine = np.array([0.0, 1.0, 3.0]), np.linspace(0, 3, 31)
-        path, reference = np.array([[0.0, 0], [1, 0], [1, 2]]), np.ones((31, 2))
-        finer = np.stack([np.interp(fine, times, path[:, k]) for k in (0, 1)], axis=1)
-        coarse_rms = rms_at_equal_times(times, path, fine, reference)
-        assert coarse_rms == pytest.approx(rms_at_equal_times(fine, finer, fine, reference))
-
-    def test_a_motion_that_ends_early_rests_at_its_end(self):
-        early = rms_at_equal_times(np.array([0.0, 1]), LINE, np.array([1.0, 2]), np.array([[1.0, 0], [3, 0]]))
-        assert early == pytest.approx(np.sqrt((0 + 4) / 2))
+def test_the_rms_at_equal_times_does_not_depend_on_samples_and_what_ends_early_rests_at_its_end():
+    times, fine = np.array([0.0, 1.0, 3.0]), np.linspace(0, 3, 31)
+    path = np.array([[0.0, 0], [1, 0], [1, 2]])
+    finer = np.stack([np.interp(fine, times, path[:, k]) for k in (0, 1)], axis=1)
+    assert rms_at_equal_times(times, path, fine, finer + np.array([0.3, 0.4])) == pytest.approx(0.5)
+    early = rms_at_equal_times(np.array([0.0, 1]), LINE, np.array([1.0, 2]), np.array([[1.0, 0], [3, 0]]))
+    assert early == pytest.approx(np.sqrt((0 + 4) / 2))
 
 
 class TestMaximumCollisionDistance:
-    @pytest.mark.parametrize(
-        ("path", "radius", "depth"),
-        [
-            pytest.param(half_circle(1.0), 0.9, 0, id="clear"),
-            pytest.param(np.array([[-1.0, 0.101], [1.0, 0.101]]), 0.1, 0, id="a segment just outside"),
-            pytest.param(np.array([[-1.0, 0.03], [1.37, 0.03]]), 0.1, 0.07, id="between two samples"),
-            pytest.param(np.zeros((1, 2)), 0.2, 0.2, id="a single point"),
-        ],
-    )
-    def test_is_known_for_a_disc(self, path, radius, depth):
-        found = maximum_collision_distance(path, sphere(np.zeros(2), radius))
-        assert found == (pytest.approx(depth, abs=1e-5) if depth else 0)
-
     def test_ends_when_a_whole_segment_is_equally_deep(self):
         slab = maximum_collision_distance(LINE, lambda points: np.abs(points[:, 1]) - 0.05)
         assert slab == pytest.approx(0.05)

@@ -15,7 +15,7 @@ from dt_viz.scenario.own import Own
 from dt_viz.scenario.saved import Saved, encode
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import TASKS, own_task
-from dt_viz.ui.visitor import initial_scenario
+from dt_viz.ui.visitor import initial
 
 BALL = dt.Sphere((0.05, -0.5, 0.40), 0.10)
 AROUND = changed(
@@ -73,7 +73,7 @@ def test_a_scenario_moves_in_the_library_as_on_the_page_and_is_the_same_file_aga
 def test_demonstrations_in_a_file_move_as_on_the_page(task, new_engine, tmp_path):
     engine = new_engine()
     given = own_task(TASKS[task]().demonstrations).placed(0.8, (0.1, 0.0, 1 / 3))
-    own, _ = engine.bring(given, "draw_s")
+    own, _ = engine.bring(given)
     scenario = changed(Scenario(own.name), obstacles=(BALL,), space="task")
     motion = dt.Motion.load(written(tmp_path, Saved(scenario, own=Own.of(own))))
     assert_moves_as(motion, engine.solved(scenario, FINE))
@@ -111,24 +111,9 @@ def on_page(motion, folder, new_engine):
     assert is_motion(folder / "my_motion.npz")
     task = motion_task(folder / "my_motion.npz")
     engine = new_engine()
-    own, _ = engine.bring(task, "draw_s")
-    scenario = initial_scenario(engine, own.name)
+    own, _ = engine.bring(task)
+    scenario = initial(engine.task(own.name))
     return engine, own, scenario, engine.solved(scenario, FINE)
-
-
-@pytest.mark.long
-def test_a_saved_motion_in_space_is_the_same_on_the_page_and_goes_on_as_a_scenario(tmp_path, new_engine):
-    ball = dt.Sphere((-0.02, -0.31, 0.33), 0.08)
-    motion = dt.fit([*arcs(3)], settings=dt.ImitationSettings(num_layers=2)).stack(
-        dt.BiasPoint((0.0, -0.25, 0.3)), dt.Avoidance(ball, margin=0.01)
-    )
-    _, own, scenario, solved = on_page(motion, tmp_path, new_engine)
-    assert motion.solution.bundle.positions.tobytes() == solved.stack.bundle.positions.tobytes()
-    path = written(tmp_path, Saved(scenario, own=Own.of(own)))
-    again = dt.Motion.load(path)
-    assert_moves_as(again, solved)
-    again.save(tmp_path / "b.json")
-    assert (tmp_path / "b.json").read_bytes() == path.read_bytes()
 
 
 def test_a_saved_drawing_is_put_before_the_robot_with_its_obstacles(tmp_path, new_engine):
@@ -146,13 +131,3 @@ def test_a_saved_drawing_is_put_before_the_robot_with_its_obstacles(tmp_path, ne
     ):
         assert dt_metrics.discrete_frechet(own.to_world(path.positions), theirs.positions) < 2e-3
     assert solved.stack.bundle.paths
-
-
-@pytest.mark.long
-def test_a_motion_that_the_page_has_not_is_refused_by_what_it_has_not(tmp_path):
-    ball = dt.Sphere((-0.02, -0.31, 0.33), 0.08)
-    dt.fit([*arcs(3)]).stack(dt.Avoidance(ball), dt.Avoidance(ball)).save(tmp_path / "a.npz")
-    with pytest.raises(dt.DataError, match="transforms 'Avoidance': found 2; accepted: at most 1"):
-        motion_task(tmp_path / "a.npz")
-    np.savez(tmp_path / "b.npz", positions_0=np.eye(3))
-    assert not is_motion(tmp_path / "b.npz") and not is_motion(tmp_path) and not is_motion(tmp_path / "none")

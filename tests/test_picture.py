@@ -9,7 +9,7 @@ from chromium import needs_chromium
 from PIL import Image
 
 from dt_viz.cli import main
-from dt_viz.picture_making import SETTINGS
+from dt_viz.picture_making import VARIABLE
 from dt_viz.scenario.own import Own
 from dt_viz.scenario.saved import Saved, encode
 from dt_viz.scenario.scenario import Scenario
@@ -43,7 +43,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of matp
 )
 def test_what_cannot_be_is_refused_in_one_line(given, said, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv(SETTINGS.variable, "true")  # a command that there is
+    monkeypatch.setenv(VARIABLE, "true")  # a command that there is
     assert main(["picture", *given]) == 2
     out, error = capsys.readouterr()
     assert not out and error.startswith(f"dt-viz picture: {said}") and error.count("\n") == 1
@@ -51,7 +51,7 @@ def test_what_cannot_be_is_refused_in_one_line(given, said, capsys, tmp_path, mo
 
 
 def test_a_png_needs_a_browser_and_says_so(capsys, tmp_path, monkeypatch):
-    monkeypatch.setenv(SETTINGS.variable, str(tmp_path / "no-browser"))
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "no-browser"))
     assert main(["picture", "draw_s", "--out", str(tmp_path / "f.png")]) == 2
     error = capsys.readouterr().err
     assert error.startswith("dt-viz picture: Chromium: found ") and "or its path in DT_VIZ_CHROMIUM" in error
@@ -62,8 +62,8 @@ def test_a_browser_that_opens_nothing_is_given_up(does, said, capsys, tmp_path, 
     browser = tmp_path / "browser"
     browser.write_text(f"#!/bin/sh\n{does}\n")
     browser.chmod(0o755)
-    monkeypatch.setenv(SETTINGS.variable, str(browser))
-    monkeypatch.setattr("dt_viz.picture_making.SETTINGS", type(SETTINGS)(patience=0.5))
+    monkeypatch.setenv(VARIABLE, str(browser))
+    monkeypatch.setattr("dt_viz.picture_making.PATIENCE", 0.5)
     assert main(["picture", "draw_s", "--out", str(tmp_path / "f.png")]) == 2
     assert said in capsys.readouterr().err
     assert [*tmp_path.iterdir()] == [browser]
@@ -85,12 +85,12 @@ def test_a_saved_scenario_is_recorded_with_its_demonstrations_its_arm_and_its_ca
     monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
     made, recorded, engine = [], [], ArmStore.engine
     monkeypatch.setattr(ArmStore, "engine", lambda store, name: made.append(name) or engine(store))
-    monkeypatch.setattr("dt_viz.picture_making.record", lambda *given: recorded.append(given) or b"page")
+    monkeypatch.setattr("dt_viz.picture_making.drawn", lambda *given: recorded.append(given) or b"page")
     own, sight = own_task(TASKS["push_box"]().demonstrations[:3]), ((0.4, -2.2, 1.4), (0.2, -0.3, 0.2))
     text = encode(Saved(Scenario(OWN, (), arm="panda"), sight, Own.of(own)))
     (tmp_path / "a.json").write_text(text)
     assert main(["picture", str(tmp_path / "a.json"), "--out", str(tmp_path / "f.html")]) == 0
-    ((frame, _follower, pose),) = recorded
+    ((frame, _suffix, _follower, pose),) = recorded
     assert made == ["panda"] and np.array_equal(pose, sight)
     assert frame.task.demonstrations[0].positions.tobytes() == own.demonstrations[0].positions.tobytes()
     (tmp_path / "a.json").write_text(text.replace('"warp":1.0', '"warp":7.0'))

@@ -1,10 +1,7 @@
 """Saved motions: read back to the last bit, written whole or not at all, and refused where they make no sense."""
 
 import json
-import os
 import re
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -25,14 +22,13 @@ from dt_viz.files import npz, triangles
 from dt_viz.files.values import packed, unpacked
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.obstacles import clouds, solids
-from dt_viz.obstacles.shapes import SHAPES, MeshObstacle, Obstacle
-from dt_viz.saving import FORMAT, MAX_BYTES, read_motion, sent_motion_task
+from dt_viz.obstacles.shapes import SHAPES, Obstacle
+from dt_viz.saving import FORMAT, MAX_ARRAYS, MAX_BYTES, MAX_TEXT, read_motion, sent_motion_task
 from dt_viz.shipped import ASSETS
 
 FROZEN = Path(__file__).parent / "frozen"
 
-SHAPED = cast(dt.Avoidance, hostile.STACK[0]).obstacles
-"""An obstacle of each kind."""
+SHAPED = cast(dt.Avoidance, hostile.STACK[0]).obstacles  # an obstacle of each kind
 
 
 def arcs(dim=2):
@@ -96,37 +92,6 @@ def test_a_motion_is_read_back_to_the_last_bit(motions, name, tmp_path):
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
 
 
-@pytest.mark.long
-def test_all_kinds_of_transforms_and_obstacles_are_among_them(motions):
-    stacked = [transform for motion in motions.values() for transform in motion.transforms]
-    assert {type(transform) for transform in stacked} == set(registry.KINDS)
-    assert {type(part) for transform in stacked for part in transform.avoided.parts} == set(SHAPES)
-
-
-DIGEST = """
-import hashlib, sys
-import dt_viz as dt
-from dt_viz.obstacles import clouds, solids
-solids.SETTINGS, clouds.SETTINGS = solids.GridSettings(num_nodes=1000), clouds.CloudSettings(num_nodes=1000)  # quick
-motion = dt.Motion.load(sys.argv[1])
-digest = hashlib.sha256(repr(motion.certificates()).encode())
-for path in motion.rollouts():
-    digest.update(path.positions.tobytes() + path.times.tobytes())
-digest.update(motion.velocity(motion.goal + 0.05).tobytes())
-print(digest.hexdigest())
-"""
-
-
-@pytest.mark.long
-def test_other_processes_find_the_same(motions, tmp_path):
-    motions["plane"].save(tmp_path / "a.npz")
-    command = [sys.executable, "-c", DIGEST, str(tmp_path / "a.npz")]
-    environments = [os.environ | {"PYTHONHASHSEED": seed} for seed in ("1", "2")]
-    processes = [subprocess.Popen(command, env=seeded, stdout=subprocess.PIPE) for seeded in environments]
-    one, other = (process.communicate()[0] for process in processes)
-    assert one == other and one
-
-
 def test_layers_keep_their_names_and_whether_they_are_on(saved):
     assert read_motion(saved, "a.npz")[0].layers == hostile.LAYERS
 
@@ -139,6 +104,7 @@ OBSTACLES = st.one_of(
     st.builds(dt.Sphere, POINTS, POSITIVE),
     st.builds(dt.Box, POINTS, st.tuples(*3 * [POSITIVE])),
     st.builds(dt.Cylinder, POINTS, POSITIVE, POSITIVE, st.tuples(POSITIVE, *3 * [st.floats(-1, 1)])),
+    st.builds(lambda place, lengths: dt.Capsule(place, *sorted(lengths)), POINTS, st.tuples(POSITIVE, POSITIVE)),
     st.builds(replace, st.sampled_from(SHAPED[3:]), position=POINTS, scale=POSITIVE),
 )
 TRANSFORMS = st.one_of(
@@ -284,8 +250,7 @@ def setting(*keys):
 
 AVOIDANCE = ("layers", 0, "transform")
 MESH = "motion.layers[0].transform.obstacles[3].mesh"
-LEAVE = dict.copy
-"""Changes nothing."""
+LEAVE = dict.copy  # changes nothing
 
 
 def with_old_name(motion):
@@ -294,6 +259,11 @@ def with_old_name(motion):
     avoidance |= {"class": "Avoidance", "space": "x"}
 
 
+MANY_GAUSSIANS = {"imitation.layer_0_weights": np.zeros((10_000, 2))} | {
+    "imitation.layer_0_axis_0": np.linspace(0.0, 1.0, 100),
+    "imitation.layer_0_axis_1": np.linspace(0.0, 1.0, 100),
+    "imitation.layer_0_ell_steps_forward": np.array([1.0, 250, 1]),
+}
 FORGED = {
     "another version": (setting("version", FORMAT + 1), {}, f"version: found 2; accepted: {FORMAT}; another version"),
     "no version": (lambda m: m.pop("version"), {}, "version: found None"),
@@ -365,6 +335,18 @@ FORGED = {
     "a pickled description": (LEAVE, {"motion": np.array({}, object)}, "pickled objects are never opened"),
     "numbers for the description": (LEAVE, {"motion": np.zeros(3)}, "arrays: found no text that describes a motion"),
     "other text": (LEAVE, {"motion": np.array("motion")}, "something that cannot be read"),
+    "long text": (
+        LEAVE,
+        {"motion": np.array(" " * (MAX_TEXT + 1))},
+        "text: found 3000001 characters; accepted: at most",
+    ),
+    "many layers": (lambda m: m.update(layers=m["layers"][1:] * 101), {}, "layers: found 101; accepted: at most 100"),
+    "many arrays": (
+        LEAVE,
+        {f"imitation.x{k}": np.zeros(0) for k in range(MAX_ARRAYS)},
+        r"arrays: found \d+; accepted: ",
+    ),
+    "many Gaussians": (LEAVE, MANY_GAUSSIANS, "Gaussians of what was learned, in all steps: found 2500"),
     "deep text": (LEAVE, {"motion": np.array("[" * 100_000)}, "something that cannot be read"),
     "a list": (LEAVE, {"motion": np.array("[1]")}, "version: found None"),
 }
@@ -432,11 +414,3 @@ def test_shapes_of_a_motion_that_a_visitor_has_sent_are_measured_in_another_proc
     monkeypatch.setattr(triangles, "inside_of_grid", None)  # not here
     task = sent_motion_task("a.npz", hostile.sent_motion(), never)
     assert [part.depth > 0 for layer in task.layers for part in layer.transform.avoided.parts] == [True] * len(SHAPED)
-
-
-def test_meshes_are_shared_by_content(flat, tmp_path):
-    mesh = SHAPED[3]
-    assert isinstance(mesh, MeshObstacle)
-    flat.stack(dt.Avoidance(mesh)).save(tmp_path / "a")
-    (again,) = dt.Motion.load(tmp_path / "a").transforms[0].avoided.parts
-    assert again == mesh and cast(MeshObstacle, again).mesh.distances is mesh.mesh.distances

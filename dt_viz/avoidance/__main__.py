@@ -1,29 +1,23 @@
-"""Compile what a drag repeats for a server, which waits; ends with the server. Prints the part done, line by line.
-
-The argument `backwards` has it begin with the last kernel.
-"""
+"""Compile all kernels that a drag calls, for a server; ends with the server. Prints the fraction done, line by line."""
 
 import os
 import sys
 import threading
 
 from dt_viz.avoidance.arm import WholeArm
-from dt_viz.kernels.compiled import complete, wait_for_nobody
 from dt_viz.robot.models import load_jaco
 
 
 def _end_with_server() -> None:
-    sys.stdin.read()  # it gets nothing
+    sys.stdin.read()  # until the server ends
     os._exit(1)
 
 
 def main() -> None:
     """Compile."""
     threading.Thread(target=_end_with_server, daemon=True).start()
-    wait_for_nobody()
-    for fraction in WholeArm(load_jaco()).compiled(backwards=sys.argv[1:] == ["backwards"]):
+    for fraction in WholeArm(load_jaco()).compiled():
         print(fraction, flush=True)
-    complete()
 
 
 if __name__ == "__main__":

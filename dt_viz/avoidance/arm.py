@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.sparse.csgraph import connected_components
 
-from dt_viz.avoidance.arm_field import JointLimits, WholeArmField
-from dt_viz.avoidance.arm_settings import WholeArmSettings
+from dt_viz.avoidance.arm_field import JointLimits, WholeArmField, WholeArmSettings
 from dt_viz.avoidance.arm_solver import MARGIN_TOLERANCE, MAX_DURATION, SLOPE, ArmSolution, Solver
 from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.avoidance.detour import Detour, carried_over, escape_directions
@@ -23,6 +22,7 @@ from dt_viz.avoidance.lift import Lift
 from dt_viz.avoidance.passing import ANEW, Passing
 from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.kernels.blocks import room_asked
+from dt_viz.kernels.compiled import complete
 from dt_viz.kernels.dodging import Forecast, LimitedArm, dodge
 from dt_viz.kernels.limits import barrier, velocity_bounds
 from dt_viz.kernels.proximity import contacts, least_contacts, proximity
@@ -31,13 +31,10 @@ from dt_viz.numerics import unit
 from dt_viz.obstacles.shapes import Obstacle, Sphere, records
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.inverse_kinematics import track
-from dt_viz.robot.robot import Robot
-from dt_viz.robot.sizing import sized
+from dt_viz.robot.robot import Robot, sized
 
-NUM_COMPARED = 60
-"""Colliding samples that escapes are compared by."""
-NUM_ESCAPES = 3
-"""Largest number of escapes from each obstacle that are tried."""
+NUM_COMPARED = 60  # colliding samples that escapes are compared by
+NUM_ESCAPES = 3  # largest number of escapes from each obstacle that are tried
 
 
 class WholeArm:
@@ -51,8 +48,8 @@ class WholeArm:
         self.limits = JointLimits(robot.lower, robot.upper)
         self._solver = partial(Solver, robot, self.body, self.limits)
 
-    def compiled(self, *, backwards: bool = False) -> Iterator[float]:
-        """Compile what a drag repeats for this processor, or load what was compiled before; yields the part done."""
+    def compiled(self) -> Iterator[float]:
+        """Compile the kernels that a drag calls, or load them from the cache; yields the fraction done."""
         robot, q, obstacle = self.robot, self.robot.home[None].copy(), Sphere((0.0, 0.0, 0.0))
         field = WholeArmField(robot, self.body, (obstacle,), np.eye(3)[:1], q[:0], 0.1)
         points = self.body.of_chain(robot.chain(q.T))
@@ -77,9 +74,10 @@ class WholeArm:
             lambda: field(q),
             lambda: obstacle.field("free-space", 1.0)(np.zeros((1, 3))),  # the hand's fields
         )
-        for done, call in enumerate(reversed(calls) if backwards else calls, start=1):
+        for done, call in enumerate(calls, start=1):
             call()
             yield done / len(calls)
+        complete()
 
     def undisturbed(self, lifted: Lift, avoidance: ArmAvoidance, spacing: float) -> ArmSolution:
         """The motions as lifted, avoiding nothing."""

@@ -8,27 +8,75 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from dt_viz.avoidance.arm_settings import WholeArmSettings
-from dt_viz.checkpoints import checkpoint
 from dt_viz.flows.diffeomorphisms import Diffeomorphism
 from dt_viz.flows.fields import Array, CompiledField
 from dt_viz.kernels import escape
-from dt_viz.kernels.dormand_prince import RATE
+from dt_viz.kernels.runge_kutta import RATE
+from dt_viz.memo import cached_property
 from dt_viz.obstacles.shapes import Obstacle, records
 from dt_viz.robot.body_points import BodyPoints
 from dt_viz.robot.kinematics import cross
-from dt_viz.robot.robot import Robot
+from dt_viz.robot.robot import Robot, scales, sized
+from dt_viz.scheduler import checkpoint
 
-DIFFERENCE = 1e-4
-"""Step of the finite differences for the slope of an obstacle's distance, metres."""
 
-NEAREST_TO_LIMIT = 0.9
-"""Part of the zone before a joint limit that a planned path may use."""
+@dataclass(frozen=True)
+class WholeArmSettings:
+    """Settings of `dt_viz.avoidance.arm`, of its field, and of the reference postures."""
+
+    reach_per_temperature: float = scales(0.08 / 6)
+    """Reach of an obstacle's field, metres, for each unit of the temperature T."""
+    beyond: float = scales(0.03)
+    """Reach of the field of a robot in the loop beyond the margin, metres, at least."""
+    core: float = 0.5
+    """Depth at which the field has its full strength, as a part of the way from touching the obstacle to its middle;
+    deeper inside the strength is constant, so the middle is not singular."""
+    fan: float = 4.0
+    """Distance of the source, from which escaping points fan out, behind the obstacle's middle, in the obstacle's
+    radii."""
+    behind: float = 1.25
+    """Lower bound of that distance, in multiples of the field's outer radius, for no point may escape from the
+    source."""
+    damping: float = scales(0.06)
+    """Damping λ of the contact's pseudo-inverse, m/rad: contacts that joints can hardly move are not chased."""
+    hand_weight: float = scales(100.0, -2)
+    """Weight of the end effector's motion, rad²/m²: a contact of the forearm is resolved with the hand at rest."""
+    pin: float = scales(0.02)
+    """Size of the region around a pinned posture in which the field fades out, metres by `Robot.levers`."""
+    speed: float = scales(0.2)
+    """Distance that a contact at full strength escapes in a unit of flow time, metres."""
+    coarse_spacing: float = scales(0.025)
+    """Largest distance between neighbouring samples of coarse motions, metres at the hand, about."""
+    beside: float = scales(0.20)
+    """Clearance up to which a sample is bent along with the colliding ones, metres."""
+    together: float = scales(0.05)
+    """Clearance from another obstacle up to which a colliding posture meets both, metres."""
+    opposed: float = -0.5
+    """Cosine of the angle between the escapes from two obstacles beyond which both are left in one direction."""
+    duration_change: float = scales(50.0, -1)
+    """Largest change of the flow time for each metre that an obstacle is dragged: contacts move by 1 cm a
+    millimetre."""
+    alike: float = scales(0.15)
+    """Root mean square distance of postures, by `Robot.levers`, up to which reference postures are alike, metres."""
+    in_the_way: float = 10.0
+    """Cost of each metre that the mean motion lacks of the clearance that is asked for, against a metre from the usual
+    postures."""
+    at_ends: float = 40.0  # factor by which that costs more at the ends of the motion
+    ends: float = scales(0.06)  # distance from them over which this fades, metres
+
+    @classmethod
+    def of(cls, robot: Robot) -> WholeArmSettings:
+        """The settings for an arm."""
+        return sized(cls(), robot.size)
+
+
+DIFFERENCE = 1e-4  # step of the finite differences for the slope of an obstacle's distance, metres
+
+NEAREST_TO_LIMIT = 0.9  # part of the zone before a joint limit that a planned path may use
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +84,7 @@ class ArmField(ABC):
     """Base of the generators V_q on Rⁿ of an arm and obstacles."""
 
     robot: Robot
-    body: BodyPoints
-    """Body points that can be moved away."""
+    body: BodyPoints  # body points that can be moved away
     obstacles: tuple[Obstacle, ...]
 
     @cached_property
@@ -73,12 +120,9 @@ class WholeArmField(ArmField, CompiledField):
     the path with the first joint and turns sharply, see dt_viz/README.md.
     """
 
-    directions: Array
-    """(K, 3) unit vectors in which the arm escapes from the obstacles."""
-    pins: Array
-    """(M, n) postures that do not move, rad."""
-    reach: float
-    """Distance from an obstacle's surface at which the field ends, metres."""
+    directions: Array  # (K, 3) unit vectors in which the arm escapes from the obstacles
+    pins: Array  # (M, n) postures that do not move, rad
+    reach: float  # distance from an obstacle's surface at which the field ends, metres
 
     @cached_property
     def _escape(self) -> escape.Escape:
@@ -126,8 +170,7 @@ class GradientField(ArmField):
     It moves start and goal, too, and ignores the motion of the hand. Those of several obstacles add up.
     """
 
-    reach: float
-    """Distance from the obstacle's surface at which the field ends, metres."""
+    reach: float  # distance from the obstacle's surface at which the field ends, metres
 
     def __call__(self, q: Array) -> Array:
         """Compute V_q at configurations `q` (N, n), as (N, n)."""
@@ -163,12 +206,9 @@ class JointLimits(Diffeomorphism):
     """
 
     SCALED = ("fraction",)
-    lower: Array
-    """(n,) rad, −inf for continuous joints."""
-    upper: Array
-    """(n,) rad, +inf for continuous joints."""
-    zone: float = 0.05
-    """m, rad."""
+    lower: Array  # (n,) rad, −inf for continuous joints
+    upper: Array  # (n,) rad, +inf for continuous joints
+    zone: float = 0.05  # m, rad
     fraction: float = 1.0
     """Part s of that time: (e/m)² becomes s·(e/m)² in both formulas; less than 1 holds no joint inside its limits."""
 

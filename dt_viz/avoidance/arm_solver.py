@@ -5,27 +5,23 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
-from dt_viz.avoidance.arm_field import GradientField, JointLimits, WholeArmField
-from dt_viz.avoidance.arm_settings import WholeArmSettings
-from dt_viz.avoidance.avoidance import ArmAvoidance
-from dt_viz.avoidance.clearing import Lack, clearing_duration
+from dt_viz.avoidance.arm_field import GradientField, JointLimits, WholeArmField, WholeArmSettings
+from dt_viz.avoidance.avoidance import ArmAvoidance, Lack, clearing_duration
 from dt_viz.avoidance.detour import Detour
 from dt_viz.avoidance.lift import Lift
 from dt_viz.flows.diffeomorphisms import Conjugated, Diffeomorphism, Flow, Identity
 from dt_viz.flows.fields import Array, Indices, Mask, VectorField
 from dt_viz.flows.rollouts import Bundle, refined
 from dt_viz.kernels.blocks import room_asked
+from dt_viz.memo import cached_property
 from dt_viz.robot.body_points import BodyPoints
 from dt_viz.robot.robot import Robot
 
-NUM_COARSE = 40
-"""Number of samples of each rollout of coarse motions, before refinement."""
-MAX_DURATION = 2.0
-"""Longest flow that is tried: a contact at full strength moves by 40 cm in it."""
+NUM_COARSE = 40  # number of samples of each rollout of coarse motions, before refinement
+MAX_DURATION = 2.0  # longest flow that is tried: a contact at full strength moves by 40 cm in it
 SNAPSHOT = 0.1
 """Flow time between two checks of the clearance: contacts move by at most two centimetres in it."""
 STRIDE = 3
@@ -35,14 +31,11 @@ MAX_ROUNDS = 4
 """Largest number of rounds in which the flow is prolonged for samples that refinement has added."""
 SLOPE = 0.1
 """Slope, m/m, at which the required clearance grows away from a start or goal that has less than the margin."""
-MOVED = 5e-3
-"""Smallest shift of an added start by the avoidance that is reported, metres."""
-MARGIN_TOLERANCE = 1e-3
-"""Tolerance of a clearance, metres."""
+MOVED = 5e-3  # smallest shift of an added start by the avoidance that is reported, metres
+MARGIN_TOLERANCE = 1e-3  # tolerance of a clearance, metres
 COARSE_STEP = 0.25
 """Length of a coarse RK4 step, in flow time: off by at most 1.2 mm at the hand in drags around Draw S and push box."""
-TOLERANCE = 3e-9
-"""Tolerance of a step of the fine flow, rad."""
+TOLERANCE = 3e-9  # tolerance of a step of the fine flow, rad
 LONG = 1.0
 """Flow time beyond which other escapes and reference postures are tried, too: such motions wind around the obstacle."""
 
@@ -53,25 +46,17 @@ class ArmSolution:
 
     transform: Diffeomorphism
     """ψ_q, from the configurations where the arm moves to those of the undisturbed motion."""
-    index: Indices
-    """(N,) which rollout a sample belongs to, not decreasing."""
-    fraction: Array
-    """(N,) where on its base ray it is."""
-    q: Array
-    """(N, n) without avoidance, rad."""
-    p: Array
-    """(N, n) the motion, rad."""
-    duration: float
-    """t of the avoidance flow."""
+    index: Indices  # (N,) which rollout a sample belongs to, not decreasing
+    fraction: Array  # (N,) where on its base ray it is
+    q: Array  # (N, n) without avoidance, rad
+    p: Array  # (N, n) the motion, rad
+    duration: float  # t of the avoidance flow
     clearance: float
     """Smallest distance of the arm from the obstacle along the rollouts that shape the flow, metres; only where it is
     near, else less."""
-    stuck: Mask
-    """(R,) rollouts that shape the flow and do not keep the clearance that is asked for."""
-    too_near: Mask
-    """(R,) other rollouts that do not keep it."""
-    moved: Mask
-    """(R,) other rollouts that begin more than `MOVED` away from their start."""
+    stuck: Mask  # (R,) rollouts that shape the flow and do not keep the clearance that is asked for
+    too_near: Mask  # (R,) other rollouts that do not keep it
+    moved: Mask  # (R,) other rollouts that begin more than `MOVED` away from their start
     detours: tuple[Detour | None, ...] = ()
     """Detour around each obstacle; None for those that are not in the way, empty where none is."""
 

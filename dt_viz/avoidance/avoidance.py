@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from enum import Enum
 from typing import Any, ClassVar, Literal, TypeVar, get_args
 
 import numpy as np
@@ -12,10 +12,13 @@ import numpy as np
 from dt_viz.avoidance.detour import DETOUR, DetourSettings
 from dt_viz.avoidance.transform import MOST_DURATION, Built, MotionBelow, Transform
 from dt_viz.errors import FormatError, check_between
-from dt_viz.flows.diffeomorphisms import AUTO, Identity, Integration
+from dt_viz.flows.diffeomorphisms import AUTO, Flow, Identity, Integration
+from dt_viz.flows.fields import Array, Mask, VectorField
+from dt_viz.memo import cached_property
 from dt_viz.obstacles.occupancy import Generator
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.union import Union
+from dt_viz.warning import Kind, MotionWarning
 
 Space = Literal["task", "cspace"]
 """Space of the avoidance: that of the end effector, or configuration space."""
@@ -118,3 +121,52 @@ class Avoidance(Transform):
 
 class ArmAvoidance(Avoidance, space="cspace"):
     """The whole arm avoids, in configuration space (sec. 4.5), see `dt_viz.avoidance.arm`."""
+
+
+Lack = Callable[[Array, float], Array]
+"""What points (N, d) lack to be clear, (N,), at most 0 where they are; beyond the given lack, only that."""
+
+
+def clearing_duration(field: VectorField, points: Array, lack: Lack, step: float, longest: float) -> float | None:
+    """Find the shortest duration after which the reverse flow of a field has carried all points (N, d) clear.
+
+    γ is a one-parameter group, so one integration with snapshots, at each `step` of RK4, passes every duration on its
+    way; points that are clear stay clear and are dropped. Between the last two snapshots the duration is interpolated.
+
+    Returns None where some point is not clear after the longest one.
+    """
+    duration, before = 0.0, points
+    while (lacking := lack(points, 1e-4) > 0).any():  # whether, not how much
+        if duration >= longest:
+            return None
+        before = points[lacking]
+        points = Flow(field, step, 1).inverse(before)
+        duration += step
+    if not duration:
+        return 0.0
+    lacked, left = lack(before, np.inf), lack(points, np.inf)
+    return duration - step + step * float((lacked / np.maximum(lacked - left, 1e-12)).clip(0, 1).max())
+
+
+class StartStatus(Enum):
+    """Whether a start has a motion, or why it has none."""
+
+    OK = "with a motion"
+    OUT_OF_REACH = "out of the arm's reach"
+    IN_COLLISION = "inside the obstacle: the arm there touches it"
+    NO_WAY = "without a way around the obstacle for the arm"
+
+    @property
+    def kind(self) -> Kind:
+        """Kind of the warning about a start that has no motion."""
+        return Kind.OUT_OF_REACH if self is StartStatus.OUT_OF_REACH else Kind.START_COVERED
+
+
+def start_warnings(which: Mask, added: Mask, kind: Kind, how: str, source: str = "") -> Iterator[MotionWarning]:
+    """Yield warnings that starts `which` (R,) are `how`: one about the task's, one about `added` ones (R,)."""
+    for group, of in ((~added, ""), (added, "added ")):
+        numbers = 1 + np.flatnonzero(which[group])
+        if len(numbers):
+            starts = "start" if len(numbers) == 1 else "starts"
+            are = "is" if len(numbers) == 1 else "are"
+            yield MotionWarning(kind, f"{of}{starts} {', '.join(map(str, numbers))} {are} {how}", source)

@@ -7,30 +7,89 @@ between them is gathered, by the field of unit vectors without its part along th
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
 
-from dt_viz.avoidance.bias_fields import Shift, shifting_time, unit_field
-from dt_viz.avoidance.clearing import clearing_duration
+from dt_viz.avoidance.avoidance import clearing_duration
 from dt_viz.avoidance.transform import MOST_DURATION, Anchored, Built, MotionBelow, axes_of
 from dt_viz.errors import check_between
 from dt_viz.flows.diffeomorphisms import AUTO, Chain, Diffeomorphism, Flow, Identity, Integration
-from dt_viz.flows.fields import Array, PlacedField, Projected, VectorField
+from dt_viz.flows.fields import Array, GaussianGrid, GridRBF, PlacedField, PointField, Projected, VectorField
+from dt_viz.kernels.fields import REGION, SHIFT, TERM, Terms
 from dt_viz.obstacles.shapes import Point, as_point
 from dt_viz.warning import Kind, MotionWarning
 
+NUM_SAMPLES = 400
+"""Number of unit vectors sampled in one octant of the region, or quadrant of the disc; the others mirror them."""
+KERNEL_WIDTH = 0.4
+"""Kernel width of the regression, in radii; about the size of the core in which it smooths the unit vectors, which are
+singular at the target."""
+
+
+@dataclass(frozen=True)
+class RegionField(PointField):
+    """A field on the unit ball (or on the cylinder over the unit disc) that fades out smoothly towards its border.
+
+    V(s) = (1 − ‖u‖²)³·V_fit(u), u the first k coordinates of s; the others are not moved.
+    """
+
+    directions: GridRBF  # v_fit, in R^k
+
+    def _terms(self) -> Terms:
+        return self.directions.grid.terms(self.directions.weights, REGION)
+
+
+@dataclass(frozen=True, eq=False)
+class Shift(PointField):
+    """A field of one direction on the unit ball (or on the cylinder over the unit disc): V(s) = (1 − ‖u‖²)³·n."""
+
+    direction: Array  # n, (3,), a unit vector
+    dim_of_region: int  # 3 for the ball, 2 for the cylinder
+
+    def _terms(self) -> Terms:
+        term = np.zeros(1, TERM)
+        term["kind"], term["inward"] = SHIFT, np.diag([1.0, 1.0, self.dim_of_region - 2.0])
+        term["outward"][0, :, 0] = self.direction
+        return Terms(term, np.empty(0))
+
+
+def shifting_time(u: float) -> float:
+    """Time in which a shift carries a place from the distance u, in radii, to the target: ∫ du / (1 − u²)³."""
+    room = 1 - u * u
+    return u / (4 * room * room) + 3 * u / (8 * room) + 3 / 8 * math.atanh(u)
+
+
+@lru_cache(maxsize=2)
+def unit_field(dim: int) -> RegionField:
+    """The field for the unit region, ridge regression of unit vectors away from the centre of the ball of `dim`.
+
+    With every sample come its mirror images, so the centre is at rest and no sampling noise turns the field.
+    """
+    rng = np.random.default_rng(0)
+    octant = np.abs(rng.normal(size=(NUM_SAMPLES, dim)))
+    octant *= rng.uniform(size=(NUM_SAMPLES, 1)) ** (1 / dim) / np.linalg.norm(octant, axis=1, keepdims=True)
+    samples = np.concatenate([octant * signs for signs in itertools.product((-1, 1), repeat=dim)])
+    away = samples / np.linalg.norm(samples, axis=1, keepdims=True)
+    grid = GaussianGrid.covering(np.stack([-np.ones(dim), np.ones(dim)]), KERNEL_WIDTH, pad=0)
+    features = grid.features(samples)
+    gram = features.T @ features / len(samples)
+    gram[np.diag_indices_from(gram)] += 1e-3  # the ridge
+    return RegionField(GridRBF(grid, cho_solve(cho_factor(gram), features.T @ away / len(samples))))
+
+
 AIM = 0.0012
 """Largest distance from the target at which `auto` lets the motions pass, metres, at the checked samples."""
-ACCEPTED = 0.002
-"""Largest accepted distance from the target, metres, also between those samples."""
+ACCEPTED = 0.002  # largest accepted distance from the target, metres, also between those samples
 SAME_PLACE = 0.010
 """Distance up to which the target is at a start, at the goal or in the plane of the motions, metres."""
 MAX_DURATION = 4.0
 """Longest flow time that is tried: a point that has not arrived by then hardly lies in the region."""
-DEEPEST = 0.9
-"""Distance from the target, in radii, from which on a shift takes too long."""
+DEEPEST = 0.9  # distance from the target, in radii, from which on a shift takes too long
 SNAPSHOT = 0.1
 """Interval of flow time between two checks of the distance: less than half of the time that halves it."""
 LARGE, SMALL = 3.2, 1.5
@@ -39,8 +98,7 @@ outside. On a straight path at 5 cm, these turn the motion by 10° and 40° on a
 SMALLER, WIDER = 1.25, 1.5
 """Smallest radius, relative to that distance, in later attempts, and factor by which it grows in each one where starts
 or goal are in the region anyway."""
-MIN_RADIUS = 0.10
-"""Lower bound of the `auto` radius, metres."""
+MIN_RADIUS = 0.10  # lower bound of the `auto` radius, metres
 OVERSHOOT = 2.0
 """Factor by which the next attempt prolongs the duration beyond what the last one needed."""
 STEP = 2.2
@@ -236,7 +294,6 @@ class BiasPoint(Anchored):
         return to_ends, to_others
 
     def _misplaced(self, motion: MotionBelow, nearest: Array, radius: float) -> list[MotionWarning]:
-        """Warnings about the place of the bias point."""
         texts = []
         if np.linalg.norm(self.offsets(motion.goal)) < SAME_PLACE:
             texts.append("the point is on the goal, where the motions end anyway")
@@ -258,7 +315,6 @@ def _warning(motion: MotionBelow, kind: Kind, text: str) -> MotionWarning:
 
 
 def _too_small(radius: float, distance: float) -> str:
-    """Describe why not all motions arrive from the region."""
     sizes = f"the region of {100 * radius:.0f} cm is too small: a motion is {100 * distance:.0f} cm from the target"
     return sizes if distance >= radius else f"{sizes}, near the border, where the pull fades out"
 

@@ -14,11 +14,10 @@ import numpy as np
 
 from dt_viz.errors import check_between
 from dt_viz.flows.fields import Array
-from dt_viz.kernels.detours import detours, distinct
-from dt_viz.obstacles.shapes import Obstacle
-from dt_viz.obstacles.surfaces import golden_spiral
+from dt_viz.kernels.escape import detours, distinct
+from dt_viz.obstacles.shapes import Obstacle, golden_spiral
 from dt_viz.obstacles.union import Union
-from dt_viz.robot.sizing import scales
+from dt_viz.robot.robot import scales
 
 NEARBY = 0.1
 """Distance that an obstacle may move from one motion to the next for its detour to be kept, metres."""
@@ -47,14 +46,10 @@ class DetourSettings:
     arm scales with its reach, and is given for that of the JACO."""
     seconds_ahead: float = 1.5
     """Time for which the predicted poses of a moving obstacle count as occupied, s."""
-    metres_ahead: float = 0.16
-    """Largest distance of these places from where it is, metres."""
-    stride: float = 0.04
-    """Spacing of these places, metres."""
-    num_directions: int = 128
-    """Number of directions that are compared."""
-    alike: float = 40.0
-    """Largest angle between two directions of one escape, degrees."""
+    metres_ahead: float = 0.16  # largest distance of these places from where it is, metres
+    stride: float = 0.04  # spacing of these places, metres
+    num_directions: int = 128  # number of directions that are compared
+    alike: float = 40.0  # largest angle between two directions of one escape, degrees
     selectivity: float = 0.03
     """Relative difference in cost over which a direction's share in its escape falls by e, for smooth drags."""
 
@@ -136,14 +131,12 @@ class Detour:
     """The escape from one obstacle that the motions around it take."""
 
     obstacle: Obstacle
-    side: Array
-    """(3,) unit vector, the direction that was chosen."""
+    side: Array  # (3,) unit vector, the direction that was chosen
     direction: Array
     """(3,) unit vector, the escape direction of the motions: `side`, or turning to it from that of another side."""
     kept: bool = False
     """Whether there was a detour that was carried over from the obstacle's last pose."""
-    length: float = 0.0
-    """Longest displacement of a motion of the hand along `direction`, metres."""
+    length: float = 0.0  # longest displacement of a motion of the hand along `direction`, metres
     travelled: float | None = None
     """Distance by which the obstacle has moved since, metres, where the next detour turns from this one at a limited
     rate; None where it is at its side at once."""

@@ -9,11 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from dt_viz.avoidance.avoidance import Avoidance
-from dt_viz.avoidance.clearing import clearing_duration
+from dt_viz.avoidance.avoidance import Avoidance, clearing_duration, start_warnings
 from dt_viz.avoidance.detour import Detour, DetourSettings, directions_around
 from dt_viz.avoidance.sideways import Encounter, fixing_ends
-from dt_viz.avoidance.start_status import start_warnings
 from dt_viz.avoidance.transform import Built, MotionBelow, Planar, axes_of
 from dt_viz.flows.diffeomorphisms import Chain, Diffeomorphism, Flow
 from dt_viz.flows.fields import Array, Mask, Projected, VectorField
@@ -29,14 +27,11 @@ SNAPSHOT = 0.05
 of them, so a step is off by micrometres; between the last two checks the duration is interpolated."""
 TOLERANCE = 1e-5
 """Tolerance of a step of the integration up to the duration that is known to be needed, metres."""
-ROUNDING = 1e-6
-"""Depth that counts as rounding, metres: a motion may end on the surface."""
-ACCEPTED_MARGIN = 0.9
-"""Smallest part of the margin that samples between the checked ones may keep."""
+ROUNDING = 1e-6  # depth that counts as rounding, metres: a motion may end on the surface
+ACCEPTED_MARGIN = 0.9  # smallest part of the margin that samples between the checked ones may keep
 BESIDE = 1e-3
 """Tolerance of the surface of an obstacle, metres, which is known approximately; also of a covered start's depth."""
-NUM_DIRECTIONS = 360
-"""Number of directions of a plane in which the nearest free place is searched."""
+NUM_DIRECTIONS = 360  # number of directions of a plane in which the nearest free place is searched
 TAIL = 2.0
 """Length of the end of a path to a covered goal that may be inside, in distances from the goal to the nearest free
 place: such a path arrives at up to 60° from the straight escape."""

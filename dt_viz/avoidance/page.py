@@ -16,21 +16,17 @@ from dt_viz.obstacles.union import Union
 class Number:
     """A setting that is a slider on the page."""
 
-    field: str
-    """Name of the transform's field."""
+    field: str  # name of the transform's field
     label: str
     unit: str
     low: float
     high: float
     step: float
-    initial: float
-    """Value of the slider before there is one."""
-    scale: float = 1.0
-    """Units of the slider in one unit of the field."""
+    initial: float  # value of the slider before there is one
+    scale: float = 1.0  # units of the slider in one unit of the field
     automatic: bool = False
     """Whether a switch beside the slider sets the field to None, which leaves the choice to the transform."""
-    of_flow: bool = False
-    """Whether it is t of the transform's flow."""
+    of_flow: bool = False  # whether it is t of the transform's flow
     hint: str = ""
 
 
@@ -49,8 +45,7 @@ class Choice:
 
     field: str
     label: str
-    options: Mapping[Any, str]
-    """Names of the values."""
+    options: Mapping[Any, str]  # names of the values
     hint: str = ""
 
 
@@ -68,28 +63,22 @@ Setting = Number | Switch | Choice | FlowIntegration
 class Surroundings:
     """The world around a transform that is added."""
 
-    mean_path: Array
-    """(T, 3) the mean demonstration, evenly sampled, metres."""
+    mean_path: Array  # (T, 3) the mean demonstration, evenly sampled, metres
     plane: tuple[Point, Point] | None
     """Two orthonormal vectors of a drawing's plane; None of a task in space."""
     obstacle: Union
-    anchors: tuple[Point, ...]
-    """Places of other transforms, metres."""
+    anchors: tuple[Point, ...]  # places of other transforms, metres
 
 
 @dataclass(frozen=True, eq=False)
 class PageEntry:
     """A kind of transform on the page."""
 
-    title: str
-    """Name on the page; numbered where there may be more than one."""
-    hint: str = ""
-    """Explanation of the button that adds one."""
-    settings: tuple[Setting, ...] = ()
-    """Settings that the page offers."""
+    title: str  # name on the page; numbered where there may be more than one
+    hint: str = ""  # explanation of the button that adds one
+    settings: tuple[Setting, ...] = ()  # settings that the page offers
     most: int = 4
     """Largest number in a stack of the page. The only one of its kind has no button and stays outermost."""
-    flow_time: str = "t"
-    """Name of t in the list of the stack."""
+    flow_time: str = "t"  # name of t in the list of the stack
     added: Callable[[Surroundings], Transform] | None = None
     """Makes the transform that the button adds; None makes one of the kind without arguments."""

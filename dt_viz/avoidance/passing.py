@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from dt_viz.avoidance.avoidance import StartStatus
 from dt_viz.avoidance.detour import Detour, carried_over
-from dt_viz.avoidance.start_status import StartStatus
 from dt_viz.obstacles.shapes import Obstacle
 
 Posture = tuple[float, ...]
@@ -19,16 +19,11 @@ class Passing:
 
     hand: Mapping[int, tuple[Detour | None, ...]] = field(default_factory=dict)
     """Detours of the end effector around the obstacles of each layer, by its place in the stack."""
-    arm: tuple[Detour | None, ...] = ()
-    """Those of the whole arm."""
-    duration: float = 0.0
-    """t of the flow by which the whole arm avoids."""
-    cleared: bool = True
-    """Whether that flow clears the obstacles."""
-    posture: Posture | None = None
-    """Reference posture of the arm; None is its usual one."""
-    status: tuple[StartStatus, ...] = ()
-    """Status of each start, in the order of the scenario."""
+    arm: tuple[Detour | None, ...] = ()  # those of the whole arm
+    duration: float = 0.0  # t of the flow by which the whole arm avoids
+    cleared: bool = True  # whether that flow clears the obstacles
+    posture: Posture | None = None  # reference posture of the arm; None is its usual one
+    status: tuple[StartStatus, ...] = ()  # status of each start, in the order of the scenario
 
     def goes_on(self, obstacles: Sequence[Obstacle]) -> bool:
         """Return whether an obstacle that the whole arm passed is still there, or nearby."""
@@ -39,5 +34,4 @@ class Passing:
         return any(detour is not None and detour.travelled for detour in carried_over(self.arm, obstacles))
 
 
-ANEW = Passing()
-"""Nothing to keep: detours and reference posture are chosen anew."""
+ANEW = Passing()  # nothing to keep: detours and reference posture are chosen anew

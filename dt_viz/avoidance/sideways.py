@@ -26,8 +26,7 @@ from dt_viz.numerics import unit
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.union import Union, escape_lengths
 
-MAX_SAMPLES = 96
-"""Largest number of samples that sides are compared by."""
+MAX_SAMPLES = 96  # largest number of samples that sides are compared by
 BREADTH = 0.7
 """Smallest half size of A⁻¹, relative to the largest displacement; else it is the obstacle's plus the margin."""
 GAIN = 2.0
@@ -49,16 +48,11 @@ SIMPSON = np.array([1, *[4, 2] * 7, 4, 1]) / 48
 class Sideways(PointField):
     """The generator of the flow to a side; it is against n, since motions follow the reverse."""
 
-    centre: Array
-    """c, (3,), metres."""
-    inverse: Array
-    """A, (3, 3), 1/metre."""
-    velocity: Array
-    """n g, (3,), metres per unit of time."""
-    ends: Array
-    """e, (E, 3), metres."""
-    radii: Array
-    """ρ_e, (E,), metres."""
+    centre: Array  # c, (3,), metres
+    inverse: Array  # a, (3, 3), 1/metre
+    velocity: Array  # n g, (3,), metres per unit of time
+    ends: Array  # e, (E, 3), metres
+    radii: Array  # ρ_e, (E,), metres
 
     def _terms(self) -> Terms:
         term, ends = np.zeros(1, TERM), np.column_stack([self.ends, self.radii])
@@ -82,14 +76,10 @@ class Encounter:
     """Where the motions that have a demonstration come nearer to an obstacle than a margin."""
 
     obstacle: Obstacle
-    margin: float
-    """Metres."""
-    points: Array
-    """(K, 3) samples of the motions there, metres."""
-    tangents: Array
-    """(K, 3) unit vectors along the motions."""
-    ends: Array
-    """(E, 3) starts and goal outside the obstacle, metres."""
+    margin: float  # metres
+    points: Array  # (K, 3) samples of the motions there, metres
+    tangents: Array  # (K, 3) unit vectors along the motions
+    ends: Array  # (E, 3) starts and goal outside the obstacle, metres
     others: tuple[Obstacle, ...] = ()
     """Obstacles whose sides have been chosen: the escape from this one does not end in them."""
     plane: Array | None = None

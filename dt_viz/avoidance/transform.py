@@ -8,43 +8,36 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import numpy as np
 
 from dt_viz.avoidance.detour import Detour
 from dt_viz.flows.diffeomorphisms import AUTO, Diffeomorphism, Flow, Integration
 from dt_viz.flows.fields import Array, Indices, Mask
+from dt_viz.memo import cached_property
 from dt_viz.obstacles.shapes import Point
 from dt_viz.obstacles.union import Union
 from dt_viz.warning import Kind, MotionWarning
 
-MOST_DURATION = 100.0
-"""Longest flow time that a transform may have."""
+MOST_DURATION = 100.0  # longest flow time that a transform may have
 
 
 @dataclass(frozen=True)
 class MotionBelow:
     """The motion one level down, which a transform is to change."""
 
-    starts: Array
-    """(R, 3) starts, metres."""
-    goal: Array
-    """(3,) goal of the motions, metres."""
-    index: Indices
-    """(N,) which rollout a sample belongs to."""
-    positions: Array
-    """(N, 3) samples of the rollouts, metres."""
-    name: str = ""
-    """Name of the transform, for its warnings."""
-    tolerance: float = 2e-9
-    """Tolerance of a step of the transform's flow, metres."""
+    starts: Array  # (R, 3) starts, metres
+    goal: Array  # (3,) goal of the motions, metres
+    index: Indices  # (N,) which rollout a sample belongs to
+    positions: Array  # (N, 3) samples of the rollouts, metres
+    name: str = ""  # name of the transform, for its warnings
+    tolerance: float = 2e-9  # tolerance of a step of the transform's flow, metres
     earlier: Built | None = None
     """The transform as an earlier attempt made it for nearly this motion; None at the first one."""
     above: Diffeomorphism | None = None
     """ψ from the top of the stack to the manifold of the transform, as far as it has been built."""
-    keeps_goal: bool = True
-    """Whether transforms that are not meant to move the goal must keep it."""
+    keeps_goal: bool = True  # whether transforms that are not meant to move the goal must keep it
     shaping: Mask | None = None
     """(R,) rollouts that the transform is made for; None is all. The others are carried along."""
     targets: tuple[Point, ...] = ()
@@ -77,10 +70,8 @@ class MotionBelow:
 class Built:
     """A transform built for a motion."""
 
-    transform: Diffeomorphism
-    """ψ, from the manifold with the transform to the one without."""
-    duration: float
-    """t of its flow."""
+    transform: Diffeomorphism  # ψ, from the manifold with the transform to the one without
+    duration: float  # t of its flow
     goal: Array
     """(3,) goal of motions with the transform, metres: `MotionBelow.goal` if that is to stay, else its image under
     ψ⁻¹."""

@@ -7,15 +7,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from importlib.util import find_spec
+from io import BytesIO
+from pathlib import Path
 from typing import Protocol
 
-from dt_viz.errors import Cancelled, never
+import numpy as np
+
+from dt_viz.errors import Cancelled, DataError, FormatError, never, parsing
 from dt_viz.flows.fields import Array
+from dt_viz.learning.store import fingerprint
 from dt_viz.motion.nominal import Learned
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.robot import Robot
-from dt_viz.scenario.tasks import Task
+from dt_viz.scenario.tasks import TASKS, Task
+from dt_viz.shipped import ASSETS
 
 INSTALL = 'pip install "dt-viz[baselines]"'
 """Command that installs what some methods need beside DT-Viz itself."""
@@ -29,8 +36,7 @@ class NotFittedError(Exception):
 class Problem:
     """What a method is fitted to."""
 
-    learned: Learned
-    """The task, and our imitation of it."""
+    learned: Learned  # the task, and our imitation of it
     robot: Robot
     postures: tuple[Array, ...]
     """Of the arm along each demonstration, (T_i, n), rad; the first row is where a motion from that start begins."""
@@ -45,14 +51,11 @@ class Problem:
 class Plan:
     """Motions around obstacles, one from each start; that of a start without a way has one sample, at the start."""
 
-    paths: tuple[Array, ...]
-    """(N_i, 3) places of the end effector, metres."""
-    times: tuple[Array, ...]
-    """(N_i,) seconds from the start."""
+    paths: tuple[Array, ...]  # (N_i, 3) places of the end effector, metres
+    times: tuple[Array, ...]  # (N_i,) seconds from the start
     joints: tuple[Array, ...] | None = None
     """(N_i, n) of the arm, rad, where the method plans them; otherwise the arm tracks the paths."""
-    warnings: tuple[str, ...] = ()
-    """What the motions fail at, for the user."""
+    warnings: tuple[str, ...] = ()  # what the motions fail at, for the user
 
 
 class Planner(Protocol):
@@ -75,26 +78,75 @@ class Planner(Protocol):
 class Method:
     """A way to learn motions from demonstrations, or to plan them."""
 
-    name: str
-    """Short name in files and commands."""
+    name: str  # short name in files and commands
     title: str
-    promise: str
-    """Sentence that says what it guarantees and what it does not."""
+    promise: str  # sentence that says what it guarantees and what it does not
     fit: Callable[[Problem], Planner]
     """Fits it to a task, or loads what was fitted to it. Raises NotFittedError where the demonstrations do not allow
     it, or what was fitted is of another task or version."""
     stable: bool = False
     """Whether it is a dynamical system whose motions reach the goal for certain; a path planned once is none."""
-    whole_arm: bool = False
-    """Whether the whole arm avoids, not the end effector alone."""
-    live: bool = False
-    """Whether it follows a drag; others plan when the obstacle rests."""
-    avoids: bool = True
-    """Whether its motions depend on the obstacle."""
-    needs: tuple[str, ...] = ()
-    """Modules beyond DT-Viz's own that it cannot plan without."""
+    whole_arm: bool = False  # whether the whole arm avoids, not the end effector alone
+    live: bool = False  # whether it follows a drag; others plan when the obstacle rests
+    avoids: bool = True  # whether its motions depend on the obstacle
+    weights: str = ""
+    """Name of the weights that it loads, which are made in advance for each task; empty if it has none."""
+    needs: tuple[str, ...] = ()  # modules beyond DT-Viz's own that it cannot plan without
 
     @property
     def missing(self) -> tuple[str, ...]:
         """Modules it needs that are not installed; see `INSTALL`."""
         return tuple(module for module in self.needs if find_spec(module) is None)
+
+
+FOLDER = ASSETS / "baselines"  # folder of the weights that ship with DT-Viz
+MADE_BY = "python -m assets.train_baselines"  # command that makes the weights, in a checkout
+ONLY_SHIPPED = "only for the shipped tasks"
+"""Reason why a method without weights for a task, such as one of the user's own, cannot be chosen."""
+
+
+class WeightsError(DataError):
+    """A file of weights that cannot be read."""
+
+
+def load_weights(method: str, version: int, task: Task, folder: Path = FOLDER) -> dict[str, Array]:
+    """Read the weights of a method for a task, floats in double precision.
+
+    Raises:
+        NotFittedError: there are none, the file is damaged, or it is of another method, version or task.
+    """
+    path = weights_file(folder, method, task.name)
+    accepted = f"weights as {MADE_BY!r} writes them"
+    if not path.is_file():
+        remedy = f"{MADE_BY} --method {method} --task {task.name}" if task.name in TASKS else ONLY_SHIPPED
+        raise NotFittedError(f"{method} has not been trained for {task.title!r}; {remedy}")
+    try:
+        with parsing(WeightsError, path, "file", accepted):
+            with np.load(BytesIO(path.read_bytes()), allow_pickle=False) as archive:
+                arrays = dict(archive)
+            for field, wanted in stamp(method, version, task).items():
+                found = arrays.pop(field).item()
+                if found != wanted:
+                    raise FormatError(field[1:], repr(found)[:80], repr(wanted))
+            for name, array in arrays.items():
+                if array.dtype.kind not in "fiub" or not np.isfinite(array).all():
+                    raise FormatError(f"array {name!r}", "text, or numbers that are not finite", "finite numbers")
+    except WeightsError as error:
+        raise NotFittedError(str(error)) from error
+    return {name: array.astype(float) if array.dtype.kind == "f" else array for name, array in arrays.items()}
+
+
+def weights_file(folder: Path, method: str, task: str) -> Path:
+    """The file of a method's weights for the task of a name."""
+    return folder / f"{method}_{task}.npz"
+
+
+@cache
+def is_trained(method: str, task: str) -> bool:
+    """Return whether a method has weights for the task of a name, as found once."""
+    return weights_file(FOLDER, method, task).is_file()
+
+
+def stamp(method: str, version: int, task: Task) -> dict[str, str | int]:
+    """Return what a file says about itself: method, version, and a digest of the task's demonstrations."""
+    return {"_method": method, "_version": version, "_demonstrations": fingerprint(task.demonstrations, "weights")}

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dt_viz.baselines.base import Plan, Planner, Problem
-from dt_viz.baselines.weights import FOLDER, load_weights
+from dt_viz.baselines.base import FOLDER, Plan, Planner, Problem, load_weights
 from dt_viz.errors import Cancelled, never
 from dt_viz.flows.diffeomorphisms import Chain, Diffeomorphism, Placed
 from dt_viz.flows.fields import Array, Indices
@@ -24,24 +24,19 @@ from dt_viz.numerics import unit
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.tasks import Task
 
-VERSION = 1
-"""Version of the weights, raised with every change to what they mean."""
+VERSION = 1  # version of the weights, raised with every change to what they mean
 
 
 @dataclass(frozen=True)
 class EFlowSettings:
     """Architecture of the networks, the authors'."""
 
-    num_blocks: int = 10
-    """Number of coupling layers."""
-    num_features: int = 200
-    """Number of random Fourier features of each of a layer's two functions."""
+    num_blocks: int = 10  # number of coupling layers
+    num_features: int = 200  # number of random Fourier features of each of a layer's two functions
     length_scale: float = 0.45
     """Length scale of the features, in the unit of the normalised demonstrations: their extent along each axis is 1."""
-    num_hidden: int = 100
-    """Width of the two hidden layers of the speed."""
-    slope: float = 0.01
-    """Slope of their leaky rectifiers below zero."""
+    num_hidden: int = 100  # width of the two hidden layers of the speed
+    slope: float = 0.01  # slope of their leaky rectifiers below zero
 
     @property
     def masks(self) -> tuple[tuple[slice, slice], ...]:
@@ -63,16 +58,13 @@ class Coupling(Diffeomorphism):
     """Affine coupling layer y_b = x_b·exp(s(x_a)) + t(x_a), y_a = x_a; s and t are sums of cosines cos(Wᵀx_a + φ)."""
 
     SCALED = ("amplitudes", "slopes")  # s and t in proportion: not a group, as that of a flow is
-    given: slice
-    """Coordinates a that s and t read."""
-    moved: slice
-    """All other coordinates, b."""
+    given: slice  # coordinates a that s and t read
+    moved: slice  # all other coordinates, b
     frequencies: Array
     """W over φ (|a| + 1, 2F), of s before those of t; its precision is that of the cosines."""
     amplitudes: Array
     """(2F, 2|b|) of the cosines in s and in t; zero where a feature of the one would meet the other."""
-    slopes: Array
-    """(2F, 2|b|·|a|) of their sines in the derivatives of s and of t."""
+    slopes: Array  # (2F, 2|b|·|a|) of their sines in the derivatives of s and of t
 
     @classmethod
     def of(cls, given: slice, moved: slice, W: Array, phases: Array, weights: Array) -> Coupling:
@@ -137,41 +129,30 @@ class Normalisation(Diffeomorphism):
         return image, None if U is None else U * scale[:, None]
 
 
-@dataclass(frozen=True, eq=False)
-class Speed:
-    """σ(y) = exp of a network with two hidden layers and leaky rectifiers, of the normalised coordinates."""
-
-    layers: Sequence[tuple[Array, Array]]
-    """Weights (out, in) and biases (out,) of each layer."""
-
-    def __call__(self, x: Array) -> Array:
-        """σ (N,), in normalised units a second, at normalised points `x` (N, k)."""
-        for W, c in self.layers[:-1]:
-            x = x @ W.T + c
-            x = np.maximum(x, ARCHITECTURE.slope * x)
-        W, c = self.layers[-1]
-        return np.exp(x @ W.T + c)[:, 0]
+def _speed(layers: Sequence[tuple[Array, Array]], x: Array) -> Array:
+    """σ (N,) = exp of a network of weights (out, in) and biases (out,), in units a second, at points `x` (N, k)."""
+    for W, c in layers[:-1]:
+        x = x @ W.T + c
+        x = np.maximum(x, ARCHITECTURE.slope * x)
+    W, c = layers[-1]
+    return np.exp(x @ W.T + c)[:, 0]
 
 
 @dataclass(frozen=True, eq=False)
 class EFlowSystem:
     """A learned EFlow in the world; stable by construction: ‖ψ(y) − ψ(y_e)‖ falls at the rate σ along every motion."""
 
-    transform: Diffeomorphism
-    """ψ from the world to the latent space, in the world's frame."""
+    transform: Diffeomorphism  # ψ from the world to the latent space, in the world's frame
     normalised: Callable[[Array], Array]
     """Takes world points (N, 3) to the normalised coordinates of the demonstrations (N, k)."""
-    speed: Speed
-    scale: float
-    """World metres for one latent unit."""
-    goal: Array
-    """y_e (3,), metres."""
-    latent_goal: Array
-    """ψ(y_e) (3,)."""
+    speed: Callable[[Array], Array]  # σ (N,), normalised units a second, at normalised points (N, k)
+    scale: float  # world metres for one latent unit
+    goal: Array  # y_e (3,), metres
+    latent_goal: Array  # ψ(y_e) (3,)
 
     @classmethod
     def of(cls, task: Task, arrays: Mapping[str, Array], precision: Any = np.float32) -> EFlowSystem:  # noqa: ANN401 - a numpy type
-        """Make the system of weights as `dt_viz.baselines.eflow_training.train` returns them for a task.
+        """Make the system of weights as `assets.eflow_training.train` returns them for a task.
 
         Cosines in single precision cost less than a micrometre.
         """
@@ -189,7 +170,7 @@ class EFlowSystem:
         layers = [(arrays[f"speed_{k}"][:, :-1], arrays[f"speed_{k}"][:, -1]) for k in range(3)]
         goal = task.to_world(arrays["goal"])
         normalised = lambda y: normalisation.forward(transform.to_frame(y)[:, :dim])  # noqa: E731
-        return cls(transform, normalised, Speed(layers), task.scale, goal, transform.forward(goal))
+        return cls(transform, normalised, partial(_speed, layers), task.scale, goal, transform.forward(goal))
 
     def velocity(self, y: Array) -> Array:
         """ẏ (N, 3), m/s, at `y` (N, 3), metres."""

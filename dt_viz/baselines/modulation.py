@@ -11,7 +11,7 @@ pace: they are integrated by the length of the path in the world, and timed afte
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid, solve_ivp
@@ -30,22 +30,14 @@ LEAST_SLANT = 0.1
 """Least n·r: beyond it the surface is not star-shaped about the reference point, and the modulation not defined."""
 
 
-@dataclass(frozen=True)
-class ModulationSettings:
-    """How exactly motions are integrated, and when they end."""
-
-    tolerance: float = 1e-3
-    """Tolerated error of a step (Runge–Kutta of order 3, Bogacki and Shampine), metres."""
-    longest_step: float = 0.06
-    """Largest length of a step, metres: obstacles are not stepped over."""
-    near_goal: float = 2e-3
-    """Distance from the goal at which a motion counts as arriving, metres."""
-    approach: float = 0.06
-    """Distance from the goal from which on steps are shorter in proportion, metres."""
-    slowest: float = 0.01
-    """Part of the imitation's speed at which a motion is about to get stuck before an obstacle."""
-    longest: float = 4.0
-    """Largest length of a path, metres."""
+TOLERANCE = 1e-3
+"""Tolerated error of a step (Runge–Kutta of order 3, Bogacki and Shampine), metres."""
+LONGEST_STEP = 0.06  # largest length of a step, metres: obstacles are not stepped over
+NEAR_GOAL = 2e-3  # distance from the goal at which a motion counts as arriving, metres
+APPROACH = 0.06  # distance from the goal from which on steps are shorter in proportion, metres
+SLOWEST = 0.01
+"""Part of the imitation's speed at which a motion is about to get stuck before an obstacle."""
+LONGEST = 4.0  # largest length of a path, metres
 
 
 def gamma(obstacle: Obstacle, distance: Array) -> Array:
@@ -79,68 +71,53 @@ def modulated(obstacle: Union, y: Array, v: Array) -> Array:
     return np.einsum("pn,pnd->nd", weights, np.array(velocities))
 
 
-@dataclass(frozen=True, eq=False)
-class _Planner:
-    system: DiffeomorphicSystem
-    """Our imitation."""
-    settings: ModulationSettings
-
-    def __call__(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
-        """Plan motions of the end effector; see `Planner`."""
-        settings, base, num = self.settings, self.system.base, len(starts)
-
-        def rate(_: float, z: Array) -> Array:
-            return self._evaluated(obstacle, z.reshape(num, 3))[1].ravel()
-
-        def left(_: float, z: Array) -> float:
-            return float(base.distance(z.reshape(num, 3)).max()) - settings.near_goal
-
-        left.terminal = True  # pyright: ignore[reportFunctionMemberAccess] - as scipy wants it
-        begin = self.system.transform.forward(starts).ravel()
-        solved = solve_ivp(
-            rate,
-            (0.0, settings.longest),
-            begin,
-            "RK23",
-            dense_output=True,
-            events=left,
-            atol=settings.tolerance,
-            max_step=settings.longest_step,
-        )
-        at = np.interp(np.arange(0, len(solved.t) - 0.75, 0.25), np.arange(len(solved.t)), solved.t)  # and between
-        z = solved.sol(at).T.reshape(-1, 3)
-        y, _, step = self._evaluated(obstacle, z)
-        pace = np.linalg.norm(base.velocity(z), axis=1)
-        clocks = cumulative_trapezoid((step / divisor(pace)).reshape(len(at), num), at, axis=0, initial=0)
-        arrives = base.distance(z[-num:]) <= 1.01 * settings.near_goal
-        paths, times, goal = [], [], self.system.transform.inverse(base.goal[None])
-        for k, (path, clock) in enumerate(zip(y.reshape(-1, num, 3).swapaxes(0, 1), clocks.T, strict=True)):
-            length = arc_length(path)
-            last = int((length < length[-1] - settings.near_goal).sum())  # from there on it rests
-            arrival = clock[last] + max(base.arrival_time(z[last * num + k], ARRIVED), ARRIVED)
-            paths.append(np.vstack([path[: last + 1], goal]) if arrives[k] else path[: last + 1])
-            times.append(np.append(clock[: last + 1], arrival) if arrives[k] else clock[: last + 1])
-        return Plan(tuple(paths), tuple(times))
-
-    def _evaluated(self, obstacle: Union, z: Array) -> tuple[Array, Array, Array]:
-        """Evaluate the modulated motion at points of base space `z` (N, 3), by the length of its path.
-
-        Returns:
-            Places (N, 3), metres; dz/ds (N, 3), shorter towards the goal; and the distance (N,) that the imitation
-            would go in base space meanwhile.
-        """
-        y, D = self.system.transform.inverse_jacobian(z)
-        offset = self.system.base.goal - z
-        nominal = np.einsum("nij,nj->ni", D, unit(offset))
-        v = modulated(obstacle, y, nominal)
-        speed = np.linalg.norm(v, axis=1) + self.settings.slowest * np.linalg.norm(nominal, axis=1)
-        step = np.tanh(np.linalg.norm(offset, axis=1) / self.settings.approach) / divisor(speed)
-        return y, step[:, None] * np.linalg.solve(D, v[..., None])[..., 0], step
-
-
-def fit(problem: Problem, settings: ModulationSettings | None = None) -> Planner:
+def fit(problem: Problem) -> Planner:
     """Take what is learned already. Raises NotFittedError where that is not a velocity at each place."""
     system = problem.learned.system
     if system.transform.dim != problem.task.starts.shape[1]:
         raise NotFittedError("modulation turns velocities at places; this task is learned in augmented states")
-    return _Planner(system, settings or ModulationSettings())
+    return partial(_plan, system)
+
+
+def _plan(system: DiffeomorphicSystem, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
+    base, num = system.base, len(starts)
+
+    def rate(_: float, z: Array) -> Array:
+        return _evaluated(system, obstacle, z.reshape(num, 3))[1].ravel()
+
+    def left(_: float, z: Array) -> float:
+        return float(base.distance(z.reshape(num, 3)).max()) - NEAR_GOAL
+
+    left.terminal = True  # pyright: ignore[reportFunctionMemberAccess] - as scipy wants it
+    begin, span, longest = system.transform.forward(starts).ravel(), (0.0, LONGEST), LONGEST_STEP
+    solved = solve_ivp(rate, span, begin, "RK23", dense_output=True, events=left, atol=TOLERANCE, max_step=longest)
+    at = np.interp(np.arange(0, len(solved.t) - 0.75, 0.25), np.arange(len(solved.t)), solved.t)  # and between
+    z = solved.sol(at).T.reshape(-1, 3)
+    y, _, step = _evaluated(system, obstacle, z)
+    pace = np.linalg.norm(base.velocity(z), axis=1)
+    clocks = cumulative_trapezoid((step / divisor(pace)).reshape(len(at), num), at, axis=0, initial=0)
+    arrives = base.distance(z[-num:]) <= 1.01 * NEAR_GOAL
+    paths, times, goal = [], [], system.transform.inverse(base.goal[None])
+    for k, (path, clock) in enumerate(zip(y.reshape(-1, num, 3).swapaxes(0, 1), clocks.T, strict=True)):
+        length = arc_length(path)
+        last = int((length < length[-1] - NEAR_GOAL).sum())  # from there on it rests
+        arrival = clock[last] + max(base.arrival_time(z[last * num + k], ARRIVED), ARRIVED)
+        paths.append(np.vstack([path[: last + 1], goal]) if arrives[k] else path[: last + 1])
+        times.append(np.append(clock[: last + 1], arrival) if arrives[k] else clock[: last + 1])
+    return Plan(tuple(paths), tuple(times))
+
+
+def _evaluated(system: DiffeomorphicSystem, obstacle: Union, z: Array) -> tuple[Array, Array, Array]:
+    """Evaluate the modulated motion at points of base space `z` (N, 3), by the length of its path.
+
+    Returns:
+        Places (N, 3), metres; dz/ds (N, 3), shorter towards the goal; and the distance (N,) that the imitation
+        would go in base space meanwhile.
+    """
+    y, D = system.transform.inverse_jacobian(z)
+    offset = system.base.goal - z
+    nominal = np.einsum("nij,nj->ni", D, unit(offset))
+    v = modulated(obstacle, y, nominal)
+    speed = np.linalg.norm(v, axis=1) + SLOWEST * np.linalg.norm(nominal, axis=1)
+    step = np.tanh(np.linalg.norm(offset, axis=1) / APPROACH) / divisor(speed)
+    return y, step[:, None] * np.linalg.solve(D, v[..., None])[..., 0], step

@@ -5,33 +5,39 @@ posture. It plans from both ends in turn until a straight line between these is 
 can do without are left out (lazy states contraction), and stretches that collide are planned again. Dropout stays
 active, so that every attempt differs.
 
-It is trained on a task's few demonstrations (`dt_viz.baselines.mpnet_training`), as in the comparison of Zhi et al.
+It is trained on a task's few demonstrations (`assets.mpnet_training`), as in the comparison of Zhi et al.
 (L4DC 2022). These hold no obstacle: the encoder, a contractive autoencoder, would see a single cloud, the empty one,
 and its loss is least where all of its weights are zero. Z is then a constant, part of the bias of the first layer, and
 there is no encoder here. MPNet avoids only as far as dropout happens to find a free way. A network trained on thousands
 of planned paths among random obstacles, as its authors' is, would do better; that is another comparison.
+
+With hybrid replanning (sec. IV) a stretch that collides is planned again by OMPL's RRT-Connect (Kuffner and LaValle,
+2000), which is complete in probability: where there is a way, it finds one if it is given the time. It knows nothing of
+the demonstrations.
 """
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from dt_viz.baselines.base import NotFittedError, Plan, Planner, Problem
+from dt_viz.baselines.base import FOLDER, NotFittedError, Plan, Planner, Problem, load_weights
 from dt_viz.baselines.postures import PlanningScene, Query, planned
-from dt_viz.baselines.weights import FOLDER, load_weights
 from dt_viz.errors import Cancelled, end_if, never
 from dt_viz.flows.fields import Array
 from dt_viz.obstacles.union import Union
+from dt_viz.robot.robot import Robot
 
-TRAINED_FOR = "jaco"
-"""Name of the arm whose postures the weights are for."""
-VERSION = 2
-"""Version of the weights, raised with every change to what they mean."""
+TRAINED_FOR = "jaco"  # name of the arm whose postures the weights are for
+_one_at_a_time = threading.Lock()  # OMPL's random numbers have one seed for the whole process
+VERSION = 2  # version of the weights, raised with every change to what they mean
 
 
 @dataclass(frozen=True)
@@ -40,16 +46,12 @@ class MPNetSettings:
 
     hidden: tuple[int, ...] = (112, 96, 64, 32)
     """Widths of the hidden layers; the authors' network has eleven, up to 1280 wide."""
-    num_certain: int = 2
-    """Number of its last layers that no dropout comes before."""
-    dropout: float = 0.5
-    """Probability that a neuron is left out, in training and in planning."""
+    num_certain: int = 2  # number of its last layers that no dropout comes before
+    dropout: float = 0.5  # probability that a neuron is left out, in training and in planning
     max_steps: int = 80
     """Largest number of postures planned for one stretch, from both ends together."""
-    max_rounds: int = 3
-    """Largest number of times that colliding stretches are planned again."""
-    seed: int = 0
-    """Seed of the dropout of each motion."""
+    max_rounds: int = 3  # largest number of times that colliding stretches are planned again
+    seed: int = 0  # seed of the dropout of each motion
 
     def widths(self, num_joints: int) -> tuple[int, ...]:
         """Widths of all layers, from (q, q_goal) to the next posture."""
@@ -63,19 +65,15 @@ ARCHITECTURE = MPNetSettings()
 class Network:
     """Linear layers with parametric rectifiers between them, and dropout after the first of these."""
 
-    weights: Sequence[Array]
-    """Of each layer, (out, in)."""
+    weights: Sequence[Array]  # of each layer, (out, in)
     biases: Sequence[Array]
-    slopes: Array
-    """Slope of the rectifier after each layer but the last, below zero."""
-    centre: Array
-    """(n,) rad, the postures' place in the network's unit."""
-    scale: Array
-    """(n,) rad for one such unit."""
+    slopes: Array  # slope of the rectifier after each layer but the last, below zero
+    centre: Array  # (n,) rad, the postures' place in the network's unit
+    scale: Array  # (n,) rad for one such unit
 
     @classmethod
     def of(cls, arrays: Mapping[str, Array]) -> Network:
-        """Make the network of arrays as `dt_viz.baselines.mpnet_training.train` returns them."""
+        """Make the network of arrays as `assets.mpnet_training.train` returns them."""
         weights, biases = ([arrays[f"{kind}_{k}"] for k in range(len(arrays["slopes"]) + 1)] for kind in "Wc")
         return cls(weights, biases, arrays["slopes"], arrays["centre"], arrays["scale"])
 
@@ -115,8 +113,7 @@ class Search:
     surroundings: PlanningScene
     rng: np.random.Generator
     cancelled: Cancelled = never
-    known: dict[bytes, bool] = field(default_factory=dict)
-    """Lines that were decided."""
+    known: dict[bytes, bool] = field(default_factory=dict)  # lines that were decided
 
     def free(self, start: Array, end: Array) -> bool:
         """Decide whether the straight line between two postures is free."""
@@ -171,29 +168,6 @@ class Search:
         return way
 
 
-@dataclass(frozen=True, eq=False)
-class MPNetPlanner:
-    """MPNet for one task; see `Planner`."""
-
-    problem: Problem
-    model: Network
-    replan: Replan | None
-
-    def __call__(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
-        """Plan around an obstacle as far as that succeeds; see `Planner`."""
-        surroundings = PlanningScene(self.problem.robot, obstacle)
-        queries, ways, colliding = [], [], 0
-        for start in starts:
-            query = Query.of(self.problem, start)
-            search = Search(self.model, surroundings, np.random.default_rng(ARCHITECTURE.seed), cancelled)
-            way = search.way(query, self.replan)
-            colliding += not search.is_free(way)
-            queries.append(query)
-            ways.append(np.stack(way))
-        warning = f"motions from {colliding} of {len(starts)} starts collide: no free way was found"
-        return planned(self.problem, queries, ways, (warning,) * (colliding > 0))
-
-
 def fit(problem: Problem, replan: Replan | None = None, folder: Path = FOLDER) -> Planner:
     """Load the task's network, and `replan`, which plans again what the network finds no free way for.
 
@@ -202,4 +176,92 @@ def fit(problem: Problem, replan: Replan | None = None, folder: Path = FOLDER) -
     """
     if problem.robot.name != TRAINED_FOR:
         raise NotFittedError(f"trained for the {TRAINED_FOR.upper()} only")
-    return MPNetPlanner(problem, Network.of(load_weights("mpnet", VERSION, problem.task, folder)), replan)
+    model = Network.of(load_weights("mpnet", VERSION, problem.task, folder))
+
+    def plan(obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
+        surroundings = PlanningScene(problem.robot, obstacle)
+        queries, ways, colliding = [Query.of(problem, start) for start in starts], [], 0
+        for query in queries:
+            search = Search(model, surroundings, np.random.default_rng(ARCHITECTURE.seed), cancelled)
+            way = search.way(query, replan)
+            colliding += not search.is_free(way)
+            ways.append(np.stack(way))
+        warning = f"motions from {colliding} of {len(starts)} starts collide: no free way was found"
+        return planned(problem, queries, ways, (warning,) * (colliding > 0))
+
+    return plan
+
+
+def fit_rrt(problem: Problem, seconds: float = 10.0) -> Planner:
+    """Load MPNet's weights; a stretch for which RRT-Connect finds no way in these seconds stays in collision."""
+
+    def replan(search: Search, start: Array, goal: Array) -> list[Array]:
+        ends_are_free = search.free(start, start) and search.free(goal, goal)
+        found = ends_are_free and rrt_connect(search.free, problem.robot, start, goal, seconds)
+        return found or [start, goal]
+
+    return fit(problem, replan)
+
+
+def rrt_connect(
+    free: Callable[[Array, Array], bool], robot: Robot, start: Array, goal: Array, seconds: float
+) -> list[Array]:
+    """Find a way between two postures (n,), rad, of lines that are `free`, seeded; empty if there is none in time."""
+    deadline, raised = time.monotonic() + seconds, []
+
+    def is_over() -> bool:
+        return bool(raised) or time.monotonic() > deadline
+
+    def is_free(start: Array, end: Array) -> bool:
+        """Ask `free`, whose exceptions are kept: they must not pass through OMPL's loops."""
+        try:
+            return not is_over() and free(start, end)
+        except BaseException as error:
+            raised.append(error)
+            return False
+
+    with _one_at_a_time:
+        found = _planned(is_free, is_over, robot, start, goal)
+    if raised:
+        raise raised[0]  # not within OMPL's frames, which its traceback would keep
+    return found
+
+
+def _planned(
+    is_free: Callable[[Array, Array], bool], is_over: Callable[[], bool], robot: Robot, start: Array, goal: Array
+) -> list[Array]:
+    from ompl import base, geometric, util  # noqa: PLC0415  # pyright: ignore[reportMissingImports] - an extra
+
+    class Motions(base.MotionValidator):
+        """Checks straight lines at every point of them, not at samples."""
+
+        def checkMotion(self, start: object, end: object) -> bool:
+            return is_free(posture(start), posture(end))
+
+    def posture(state: Any) -> Array:  # noqa: ANN401 - OMPL's
+        return np.array([state[joint] for joint in range(robot.num_joints)])
+
+    util.setLogLevel(util.LOG_NONE)
+    util.RNG.setSeed(ARCHITECTURE.seed + 1)  # 0 would be random
+    space, bounds = base.RealVectorStateSpace(robot.num_joints), base.RealVectorBounds(robot.num_joints)
+    for joint, ends in enumerate(zip(robot.lower, robot.upper, start, goal, strict=True)):
+        low, high, *both = map(float, ends)
+        bounds.setLow(joint, low if np.isfinite(low) else min(both) - np.pi)
+        bounds.setHigh(joint, high if np.isfinite(high) else max(both) + np.pi)
+    space.setBounds(bounds)
+    setup = geometric.SimpleSetup(space)
+    information = setup.getSpaceInformation()
+    motions = Motions(information)  # OMPL does not keep it
+    setup.setStateValidityChecker(lambda state: is_free(posture(state), posture(state)))
+    information.setMotionValidator(motions)
+    setup.setPlanner(geometric.RRTConnect(information))
+    states: Any = space.allocState(), space.allocState()
+    for state, q in zip(states, (start, goal), strict=True):
+        for joint, angle in enumerate(q):
+            state[joint] = float(angle)  # copyFromReals of ompl 2.0.1 crashes
+    setup.setStartAndGoalStates(*states)
+    setup.solve(base.PlannerTerminationCondition(is_over))
+    if not setup.haveExactSolutionPath():
+        return []
+    path = setup.getSolutionPath()  # owns its states
+    return [start, *(posture(state) for state in path.getStates()[1:-1]), goal]

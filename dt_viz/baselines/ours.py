@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from dt_viz.avoidance.avoidance import ArmAvoidance
@@ -14,10 +12,10 @@ from dt_viz.flows.fields import Array
 from dt_viz.motion.following import Follower
 from dt_viz.motion.nominal import Learned, Nominal
 from dt_viz.motion.solve import solve
-from dt_viz.motion.stack import FINE, Precision
+from dt_viz.motion.stack import FINE
 from dt_viz.obstacles.shapes import as_point
 from dt_viz.obstacles.union import Union
-from dt_viz.robot.retiming import within_velocity_limits
+from dt_viz.robot.joint_trajectory import within_velocity_limits
 from dt_viz.scenario.scenario import Layer, Scenario, Start
 
 
@@ -33,47 +31,41 @@ def fit_alone(problem: Problem) -> Planner:
     return plan
 
 
-@dataclass(frozen=True, eq=False)
-class _WholeArmPlanner:
-    learned: Learned
-    follower: Follower
-    precision: Precision
+def fit(problem: Problem) -> Planner:
+    """Take what is learned already; the whole arm is led around the obstacles in configuration space.
 
-    def __call__(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
-        """Plan motions of the whole arm; those that it finds no way for stay at their start. See `Planner`.
+    Motions that it finds no way for stay at their start.
+    """
+    follower = Follower(problem.robot)
 
-        Raises:
-            UnreachableError: the arm cannot get to where the task's motions start.
-        """
-        nominal, places = from_starts(self.learned, starts)
-        motions = self._moving(nominal, obstacle)
+    def plan(obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
+        nominal, places = from_starts(problem.learned, starts)
+        motions = _moving(follower, nominal, obstacle)
         if stays := set(places) - set(motions):
-            q = self.follower.undisturbed(nominal).tracked.q
+            q = follower.undisturbed(nominal).tracked.q
             motions |= {place: (q[place, :1], np.zeros(1)) for place in stays}
         joints, times = zip(*(motions[place] for place in places), strict=True)
-        return Plan(tuple(map(self.follower.robot.end_effector, joints)), times, joints)
+        return Plan(tuple(map(problem.robot.end_effector, joints)), times, joints)
 
-    def _moving(self, nominal: Nominal, obstacle: Union) -> dict[int, tuple[Array, Array]]:
-        """Joints (N, n), rad, and times (N,), s, of the rollouts that the arm finds a way for, by their place."""
-        avoidance = ArmAvoidance(obstacle.parts)
-        admission = self.follower.admission(nominal, avoidance)
-        if admission.blocked:
-            return {}
-        scenario = Scenario(nominal.task.name, (Layer(avoidance, name=AVOIDANCE.title),))
-        solved = solve(scenario, admission.nominal, self.precision, self.follower)
-        arm = solved.arm
-        if solved.blocked or arm is None:
-            return {}
-        due, limits, motions = solved.stack.rays.times(arm.index, arm.fraction), self.follower.robot.velocity_limits, {}
-        for place in np.flatnonzero(solved.nominal.moving).tolist():
-            q = arm.p[arm.index == place]
-            motions[place] = q, within_velocity_limits(due[arm.index == place], q, limits)
-        return motions
+    return plan
 
 
-def fit(problem: Problem, precision: Precision = FINE) -> Planner:
-    """Take what is learned already; the whole arm is led around the obstacles in configuration space."""
-    return _WholeArmPlanner(problem.learned, Follower(problem.robot), precision)
+def _moving(follower: Follower, nominal: Nominal, obstacle: Union) -> dict[int, tuple[Array, Array]]:
+    """Joints (N, n), rad, and times (N,), s, of the rollouts that the arm finds a way for, by their place."""
+    avoidance = ArmAvoidance(obstacle.parts)
+    admission = follower.admission(nominal, avoidance)
+    if admission.blocked:
+        return {}
+    scenario = Scenario(nominal.task.name, (Layer(avoidance, name=AVOIDANCE.title),))
+    solved = solve(scenario, admission.nominal, FINE, follower)
+    arm = solved.arm
+    if solved.blocked or arm is None:
+        return {}
+    due, limits, motions = solved.stack.rays.times(arm.index, arm.fraction), follower.robot.velocity_limits, {}
+    for place in np.flatnonzero(solved.nominal.moving).tolist():
+        q = arm.p[arm.index == place]
+        motions[place] = q, within_velocity_limits(due[arm.index == place], q, limits)
+    return motions
 
 
 def from_starts(learned: Learned, starts: Array) -> tuple[Nominal, list[int]]:

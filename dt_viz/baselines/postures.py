@@ -1,4 +1,4 @@
-"""Where methods that plan joints begin and end, how long they take, and what their way is free of."""
+"""What methods that plan joints share, and the simplest of them: straight lines to the demonstrated goal posture."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dt_viz.baselines.base import Plan, Problem
+from dt_viz.baselines.base import Plan, Planner, Problem
+from dt_viz.errors import Cancelled, never
 from dt_viz.flows.fields import Array
 from dt_viz.metrics import arc_length, interpolate
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.inverse_kinematics import inverse_kinematics
-from dt_viz.robot.retiming import within_velocity_limits
+from dt_viz.robot.joint_trajectory import within_velocity_limits
 from dt_viz.robot.robot import Robot
 
 SPACING = 0.01
@@ -23,12 +24,9 @@ SPACING = 0.01
 class Query:
     """One motion that is asked for."""
 
-    start: Array
-    """(n,) posture, rad."""
-    goal: Array
-    """(n,) posture at the end of the demonstration with the nearest start, rad."""
-    duration: float
-    """Duration of that demonstration, seconds."""
+    start: Array  # (n,) posture, rad
+    goal: Array  # (n,) posture at the end of the demonstration with the nearest start, rad
+    duration: float  # duration of that demonstration, seconds
 
     @classmethod
     def of(cls, problem: Problem, start: Array) -> Query:
@@ -92,3 +90,13 @@ def planned(problem: Problem, queries: Sequence[Query], ways: Sequence[Array], w
         times.append(within_velocity_limits(even, q, problem.robot.velocity_limits))
         paths.append(problem.robot.end_effector(q))
     return Plan(tuple(paths), tuple(times), tuple(joints), warnings)
+
+
+def fit_straight(problem: Problem) -> Planner:
+    """Take the task's postures; joints go straight from that of the start to that of the goal."""
+
+    def plan(obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
+        queries = [Query.of(problem, start) for start in starts]
+        return planned(problem, queries, [np.stack([query.start, query.goal]) for query in queries])
+
+    return plan

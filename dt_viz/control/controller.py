@@ -2,7 +2,7 @@
 
 With q(t) the course, the undisturbed motion of the joints, and ψ_q the flow around obstacles, made for where these will
 be, the robot's target is p(t) = ψ_q⁻¹(q(t)): while nothing moves, the motion of eq. (4), lifted to the joints by a
-section (`control.section`). Each tick finds the velocity nearest to ṗ + g·(p − robot) among the feasible ones
+section (`control.courses`). Each tick finds the velocity nearest to ṗ + g·(p − robot) among the feasible ones
 (`control.feasible`). The clock of the course waits in proportion to the gap, so that a robot that had to give way takes
 up its motion where it left it. Home, hold and shove are other courses of the same loop.
 """
@@ -18,10 +18,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dt_viz.avoidance.avoidance import ArmAvoidance
-from dt_viz.control.courses import Course, Progress, resting, shoved, straight_to, towards
+from dt_viz.control.courses import Course, Progress, Section, resting, shoved, straight_to, towards
 from dt_viz.control.feasible import FeasibleVelocities, Tick
 from dt_viz.control.obstacle_flow import ObstacleFlow
-from dt_viz.control.section import Section
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.flows.fields import Array
 from dt_viz.flows.rollouts import ARRIVED
@@ -29,33 +28,30 @@ from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
 from dt_viz.motion.following import Follower
 from dt_viz.motion.solve import Solved
 from dt_viz.robot.inverse_kinematics import track
-from dt_viz.robot.robot import Robot
-from dt_viz.robot.sizing import sized
+from dt_viz.robot.robot import Robot, sized
+
+STUCK = 0.95  # part of `ControllerSettings.patience`: a robot so far from its course may be stuck
+WAITING = 2.0  # seconds after which it is
 
 
 class Phase(Enum):
     """What the robot is doing."""
 
-    MOVING = "moving"
-    """It goes to the goal."""
+    MOVING = "moving"  # to the goal
     HOMING = "going home"
     RESTING = "resting"
     ASIDE = "stepped aside"
     HELD = "held"
-    TOUCHED = "touched"
-    """An obstacle touches it, or leaves no way out: it waits where it is or gives way."""
+    TOUCHED = "touched"  # an obstacle touches it, or leaves no way out
 
 
 @dataclass(frozen=True, eq=False)
 class Activity:
     """What the robot was told to do."""
 
-    heading: Phase = Phase.MOVING
-    """Where it goes, to the goal or home, also when it is let go."""
-    held: bool = False
-    """Whether somebody has its hand, so that it stays at the end of its course."""
-    let_go: bool = False
-    """Whether the hand is let go there."""
+    heading: Phase = Phase.MOVING  # where it goes, to the goal or home, also once it is released
+    held: bool = False  # whether its hand is held, so that it stays at the end of its course
+    let_go: bool = False  # whether the hand is released there
     rollout: int | None = None
     """Number of the rollout whose start it goes home to, and whose pattern it draws from there; None draws that of the
     nearest demonstration."""
@@ -89,9 +85,9 @@ class ArmController:
         self._feasible = FeasibleVelocities(follower.whole_arm, settings)
         self._activity = Activity(rollout=rollout)
         self._progress: Progress | None = None
-        self._q: Array | None = None
-        """(n,) where the robot was sent, rad."""
+        self._q: Array | None = None  # (n,) where the robot was sent, rad
         self._tick: Tick | None = None
+        self._late = 0.0  # seconds for which the robot has been far from its course
 
     @property
     def robot(self) -> Robot:
@@ -214,6 +210,10 @@ class ArmController:
                     self.release()
                 else:
                     flow.make(progress)  # what was in the way of the motion need not be in that of its end
+            is_late = not progress.ended and self.is_calm and gap > STUCK * settings.patience
+            self._late = self._late + dt if is_late else 0.0
+            if self._late > WAITING:
+                self._moved_to(self._q)  # a limit keeps it from its course, and waiting changes nothing
             return tick.velocity.copy()
 
     def steps(self, q: ArrayLike, dt: float, num: int) -> Array:
@@ -307,15 +307,13 @@ class ArmController:
 
     def _undisturbed_of(self, q: Array) -> Array:
         """Find the undisturbed posture ψ_q(p) (n,) of a robot at a posture."""
-        inside = self._follower.whole_arm.limits.inside
-        return self._flow.transform.forward(inside(q))
+        return self._flow.transform.forward(self._follower.whole_arm.limits.inside(q))
 
     def _moved_to(self, q: Array) -> None:
         """Begin anew where somebody else has moved the robot, as the image of the undisturbed motion there."""
         self._q, undisturbed = q, self._undisturbed_of(q)
         self._remember()
-        held = self._activity.held
-        self._take(resting(self.robot, undisturbed) if held else self._onwards(undisturbed))
+        self._take(resting(self.robot, undisturbed) if self._activity.held else self._onwards(undisturbed))
 
     def _change(self, course: Course | None = None, **changes: Any) -> None:  # noqa: ANN401
         """Change what the robot does: it takes a course, by default the one to where it goes then."""
@@ -363,7 +361,6 @@ def _section(follower: Follower, solved: Solved) -> Section:
 
 
 def _same_course(before: Solved, after: Solved) -> bool:
-    """Whether the undisturbed motion is the same with another stack."""
     parts, others = before.stack.parts, after.stack.parts
     same = len(parts) == len(others) and all(a is b for a, b in zip(parts, others, strict=True))
     return same and before.stack.rays.base is after.stack.rays.base

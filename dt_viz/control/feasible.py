@@ -9,38 +9,104 @@ import daqp
 import numpy as np
 
 from dt_viz.avoidance.arm import WholeArm
-from dt_viz.control.limits import ContactLimit, ObstacleLimit
-from dt_viz.control.obstacle_motion import Sighting
+from dt_viz.control.obstacle_flow import Sighting
 from dt_viz.control.settings import ControllerSettings
-from dt_viz.flows.fields import Array
+from dt_viz.flows.fields import Array, Indices
 from dt_viz.kernels.dodging import Forecast, LimitedArm, dodge
-from dt_viz.kernels.limits import velocity_bounds
+from dt_viz.kernels.limits import STEADIEST, barrier, velocity_bounds
+from dt_viz.kernels.proximity import contacts, least_contacts, proximity
 from dt_viz.obstacles.shapes import records
+from dt_viz.robot.robot import Robot
 
-SOFT = 8
-"""daqp's mark of a constraint that may be violated where there is no other way."""
+JOINTS_BETWEEN = 3
+"""Number of joints between two parts of the arm from which on they can touch: fewer do not fold them that far."""
+
+
+@dataclass(frozen=True)
+class ObstacleLimit:
+    """No part of the arm comes nearer to an obstacle than it can stop: a control barrier for each body point.
+
+    With h the distance of what its sphere holds beyond the clearance, ḣ ≥ −γh (Ames et al., "Control Barrier Functions:
+    Theory and Applications", 2019), where ḣ counts the obstacle's own velocity: what approaches moves a robot at rest,
+    too.
+    """
+
+    arm: WholeArm
+    clearance: float  # distance that is kept, metres
+    gain: float  # γ, 1/s
+    reach: float  # distance from which on a body point has a barrier, metres
+
+    def rows(self, q: Array, seen: Sighting, dt: float) -> tuple[Array, Array, float]:
+        """Slopes s (K, n) and bounds b (K,) with s·q̇ ≥ b at q (n,), and the distance from the nearest obstacle."""
+        if seen.avoidance is None or not seen.avoidance.avoided.parts:
+            return np.empty((0, len(q))), np.empty(0), np.inf
+        shapes, values = records(seen.avoidance.avoided.parts)
+        robot, links = self.arm.robot, self.arm.robot.links
+        part, distance, slopes, outward = proximity(robot.records, links.spheres, shapes, values, q, self.reach)
+        if not len(distance):
+            return slopes, distance, np.inf
+        h = distance - min(self.clearance, seen.avoidance.margin / 2)
+        near, bounds = barrier(h, slopes, self.gain, dt)
+        approach = (outward[near] * seen.velocities[part[near]]).sum(axis=1)
+        return slopes[near], approach + bounds, float(distance.min())
+
+
+@dataclass(frozen=True, eq=False)
+class ContactLimit:
+    """The arm touches neither the table nor itself: a control barrier for pairs of body points, as of obstacles.
+
+    No pair needs to be farther apart than in the undisturbed motion, which may slide along the table.
+    """
+
+    name: str  # what is not touched
+    robot: Robot
+    pairs: Indices  # (M, 2) as in `dt_viz.kernels.proximity.contacts`
+    clearance: float  # distance that is kept, metres
+    gain: float  # γ, 1/s
+
+    @classmethod
+    def table(cls, robot: Robot, clearance: float, gain: float) -> ContactLimit:
+        """Limit of the links above the table z = 0."""
+        links = robot.body.indices[robot.body.joint >= robot.num_fixed]
+        return cls("the table", robot, np.stack([np.full(len(links), -1), links], axis=1), clearance, gain)
+
+    @classmethod
+    def itself(cls, robot: Robot, clearance: float, gain: float) -> ContactLimit:
+        """Limit of the links' distances from each other and the base."""
+        return cls("itself", robot, robot.pairs(JOINTS_BETWEEN), clearance, gain)
+
+    def kept(self, q: Array) -> Array:
+        """Distances (M,) to keep in a motion whose undisturbed postures are q (N, n), metres."""
+        spheres, postures = self.robot.body.spheres, np.array(q, order="C")
+        return least_contacts(self.robot.records, spheres, self.pairs, postures, self.clearance)
+
+    def rows(self, q: Array, kept: Array, dt: float) -> tuple[Array, Array]:
+        """Slopes s (K, n) and bounds b (K,) with s·q̇ ≥ b at q (n,) where distances (M,) are kept."""
+        reach = self.clearance + self.robot.top_speed / min(self.gain, STEADIEST / dt)
+        which, apart, slopes = contacts(self.robot.records, self.robot.body.spheres, self.pairs, q, reach)
+        near, bounds = barrier(apart - kept[which], slopes, self.gain, dt)
+        return slopes[near], bounds
+
+
+SOFT = 8  # daqp's mark of a constraint that may be violated where there is no other way
 
 
 @dataclass(frozen=True, eq=False)
 class Tick:
     """What came of a tick."""
 
-    q: Array
-    """(n,) where the robot was, rad."""
-    wanted: Array
-    """(n,) velocity that was asked for, rad/s."""
-    velocity: Array
-    """(n,) that was found, rad/s."""
+    q: Array  # (n,) where the robot was, rad
+    wanted: Array  # (n,) velocity that was asked for, rad/s
+    velocity: Array  # (n,) that was found, rad/s
     evasive: Array | None
     """(n,) velocity that evades obstacles which move, rad/s; None where the wanted one leads past them."""
     contacts: list[tuple[Array, Array]]
     """Rows of the table's and the arm's own limits; see `ContactLimit.rows`."""
-    clearance: float
-    """Distance of the arm from the nearest obstacle, about, metres."""
+    clearance: float  # distance of the arm from the nearest obstacle, about, metres
 
 
 class FeasibleVelocities:
-    """Finds the velocity nearest to a wanted one that all limits allow (`dt_viz.control.limits`)."""
+    """Finds the velocity nearest to a wanted one that all limits allow (`dt_viz.control.feasible`)."""
 
     def __init__(self, arm: WholeArm, settings: ControllerSettings) -> None:
         """Make the limits of an arm."""
@@ -50,8 +116,7 @@ class FeasibleVelocities:
         self._contacts = tuple(
             make(robot, settings.clearance, settings.contact_gain) for make in (ContactLimit.table, ContactLimit.itself)
         )
-        self._kept: tuple[Array, ...] = ()
-        """Distances that are kept, for each of these."""
+        self._kept: tuple[Array, ...] = ()  # distances that are kept, for each of these
         bounds = robot.lower, robot.upper, robot.velocity_limits
         self._limited = LimitedArm(robot.records, robot.links.spheres, *bounds, settings.acceleration)
 

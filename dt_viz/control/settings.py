@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dt_viz.robot.sizing import scales
+from dt_viz.robot.robot import scales
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
-"""Reproduction of motions that were not learned from, compared with two ways that need no learning.
+"""Reproduction of demonstrations that were not learned from, beside two ways that need no learning.
 
-The demonstrations of a shape are divided into folds; those of a fold are held out, and followed from their start by
+Those of a fold are held out, and followed from their starts in each of `WAYS`:
 
 ``learned``
     the motion fitted to the others;
@@ -13,7 +13,7 @@ The demonstrations of a shape are divided into folds; those of a fold are held o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,75 +27,60 @@ from dt_viz.learning.interface import AnyImitation
 from dt_viz.metrics import arc_length, discrete_frechet, resample_by_arc_length, rms_at_equal_times
 
 WAYS = ("learned", "mean", "nearest")
-AT_GOAL = 5e-5
-"""Distance from the goal at which a rollout ends, metres."""
+AT_GOAL = 5e-5  # m from the goal at which a rollout ends
+NUM_COMPARED = 400  # points, evenly by arc length, between which a Fréchet distance is computed
 Learn = Callable[[Sequence[Demonstration]], AnyImitation]
-NUM_COMPARED = 400
-"""Number of points, evenly by arc length, between which a Fréchet distance is computed."""
 
 
 @dataclass(frozen=True)
 class Followed:
-    """A demonstration that was held out, and what it is followed by."""
+    """A demonstration that was held out, and the motions that follow it."""
 
+    number: int  # of the demonstration
     demonstration: Demonstration
-    state: str
-    """State in which the motion that follows it was learned."""
-    motions: Mapping[str, tuple[Array, Array]]
-    """Path (T, d), metres, and times (T,), seconds, of each of `WAYS`."""
-    degrees: Mapping[str, Array]
-    """Of "learned" and "mean", see `degrees_off`; empty without orientations."""
+    state: str  # in which the motion that follows it was learned
+    motions: Mapping[str, tuple[Array, Array]]  # path (T, d), metres, and times (T,), seconds, of each of `WAYS`
+    degrees: Mapping[str, Array]  # of "learned" and "mean", see `degrees_off`; empty without orientations
 
     def frechet(self, way: str) -> float:
-        """Discrete Fréchet distance from the demonstration, metres."""
+        """Return the discrete Fréchet distance from the demonstration, metres."""
         return float(frechet([self.motions[way][0]], [self.demonstration.positions])[0])
 
     def rms(self, way: str) -> float:
-        """Root mean square distance at equal times, metres."""
+        """Return the root mean square distance at equal times, metres."""
         (path, times), demonstrated = self.motions[way], self.demonstration
         return rms_at_equal_times(times, path, demonstrated.times - demonstrated.times[0], demonstrated.positions)
 
 
-def follow(demonstrations: Sequence[Demonstration], learn: Learn, folds: int) -> list[Followed]:
-    """Follow each demonstration in each of `WAYS` without having learned from it.
-
-    Args:
-        demonstrations: two or more, of one shape.
-        learn: learns from some of them.
-        folds: number of folds, at most that of demonstrations.
-
-    Raises:
-        ImitationError: nothing can be learned from the others.
-    """
-    parts = [follow_held(demonstrations, learn, held) for held in folds_of(len(demonstrations), folds)]
-    return in_order(parts)
+def folds_of(num: int, folds: int) -> list[range]:
+    """Return the numbers of the demonstrations, of `num`, that each fold holds out."""
+    return [range(fold, num, folds) for fold in range(folds)]
 
 
-def follow_held(demonstrations: Sequence[Demonstration], learn: Learn, held: range) -> dict[int, Followed]:
-    """Follow the demonstrations of one fold, by number, in each of `WAYS`; see `follow`."""
-    followed: dict[int, Followed] = {}
-    others = [d for i, d in enumerate(demonstrations) if i not in held]
-    imitation = learn(others)
+def follow(demonstrations: Sequence[Demonstration], learn: Learn, held: range) -> list[Followed]:
+    """Follow the demonstrations of a fold in each of `WAYS`. Raises ImitationError where the others teach nothing."""
+    others = [demonstration for i, demonstration in enumerate(demonstrations) if i not in held]
+    imitation, even = learn(others), np.linspace(0, 1, NUM_COMPARED)
     paths = np.stack([resample_by_arc_length(d.positions, NUM_COMPARED) for d in others])
-    progress, durations = np.stack([_progress(d) for d in others]), [d.times[-1] - d.times[0] for d in others]
+    durations = np.array([d.times[-1] - d.times[0] for d in others])
+    progress = np.stack([_progress(d) for d in others])  # part of the way that lies behind at even times
+    followed = []
     for i in held:
         start = demonstrations[i].positions[0]
         nearest = int(np.linalg.norm(paths[:, 0] - start, axis=1).argmin())
         (rollout,), (times,) = rollouts_from(imitation, start[None])
-        motions = {
-            "learned": (rollout, times),
-            "mean": _shifted(start, paths.mean(axis=0), progress.mean(axis=0), float(np.mean(durations))),
-            "nearest": _shifted(start, paths[nearest], progress[nearest], durations[nearest]),
-        }
+        motions = {"learned": (rollout, times)}
+        for way, of in {"mean": slice(None), "nearest": slice(nearest, nearest + 1)}.items():
+            moments = np.interp(even, progress[of].mean(axis=0), even)
+            motions[way] = shifted_to(start, paths[of].mean(axis=0)), durations[of].mean() * moments
         degrees = degrees_off(imitation, others, demonstrations[i])
-        followed[i] = Followed(demonstrations[i], imitation.state, motions, degrees)
+        followed.append(Followed(i, demonstrations[i], imitation.state, motions, degrees))
     return followed
 
 
-def in_order(parts: Iterable[Mapping[int, Followed]]) -> list[Followed]:
-    """What folds have followed, in the order of the demonstrations."""
-    followed = {i: found for part in parts for i, found in part.items()}
-    return [followed[i] for i in sorted(followed)]
+def _progress(demonstration: Demonstration) -> Array:
+    times, length = demonstration.times, arc_length(demonstration.positions)
+    return np.interp(np.linspace(times[0], times[-1], NUM_COMPARED), times, length / length[-1])
 
 
 def degrees_off(
@@ -104,7 +89,8 @@ def degrees_off(
     """Angles (`NUM_COMPARED`,), degrees, from the hand's orientation in a demonstration, at equal parts of the way.
 
     The way is that of the hand's pose, in which a turn counts a length (`AugmentedSettings.turn_length`). "learned" is
-    what is predicted for the demonstration's start, "mean" the mean of the others there. Empty without orientations.
+    the orientation predicted for the demonstration's start, "mean" the mean of the others there. Empty without
+    orientations.
     """
     poses = imitation.poses if isinstance(imitation, AugmentedImitation) else None
     if poses is None or demonstration.orientations is None:
@@ -125,33 +111,14 @@ def _turns(poses: AugmentedImitation, demonstration: Demonstration) -> Array:
     return resample_by_arc_length(np.hstack([demonstration.positions, vectors]), NUM_COMPARED)[:, 3:]
 
 
-def folds_of(num: int, folds: int) -> list[range]:
-    """Numbers of the demonstrations, of `num`, that each fold holds out."""
-    return [range(fold, num, folds) for fold in range(folds)]
-
-
-def _progress(demonstration: Demonstration) -> Array:
-    """The part of the length that lies behind at `NUM_COMPARED` even times."""
-    times, length = demonstration.times, arc_length(demonstration.positions)
-    return np.interp(np.linspace(times[0], times[-1], NUM_COMPARED), times, length / length[-1])
-
-
-def _shifted(start: Array, path: Array, progress: Array, duration: float) -> tuple[Array, Array]:
-    """A path (T, d), even in its length, shifted to `start` (d,), and its times (T,); `progress` is at even times."""
-    even = np.linspace(0, 1, len(path))
-    return shifted_to(start, path), duration * np.interp(even, progress, even)
-
-
 def rollouts_from(imitation: AnyImitation, starts: Array) -> tuple[Array, Array]:
     """Return learned motions (R, T, d) from `starts` (R, d), metres, up to the goal, and their times (R, T), s."""
-    rollouts, all_times = [], []
+    rollouts, all_times, system = [], [], imitation.system
     for start in starts:
-        system = imitation.system
         state = system.base.states(start)
         (end,) = arrival_times(system, system.transform.forward(state)[None])
-        times = end * np.linspace(0.0, 1.0, 1000)
-        rollouts.append(system.rollout(state, times)[:, : len(start)])
-        all_times.append(times)
+        all_times.append(end * np.linspace(0.0, 1.0, 1000))
+        rollouts.append(system.rollout(state, all_times[-1])[:, : len(start)])
     return np.stack(rollouts), np.stack(all_times)
 
 

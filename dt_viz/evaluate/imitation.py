@@ -1,56 +1,23 @@
-"""Fit demonstrations and compare each rollout with its own demonstration, in-sample or left out.
-
-    python -m dt_viz.evaluate imitation DIR/*.mat --leave-one-out --out DIR
-
-For each file the folder gets an npz, all lengths in the file's own unit (LASA: millimetres, others: metres):
-
-``rollout_i`` (T, d), ``times_i`` (T,)
-    the motion learned, from the first point of demonstration i until it is at the goal; seconds from 0.
-``goal`` (d,)
-    common end of the motions.
-``fit_seconds``, ``start_seconds``
-    time of the fit, certificates included, never from a cache; and until the motion from a new start is known, median.
-``min_det_jacobian``, ``round_trip_error``
-    smallest det J and largest ‖ψ⁻¹(ψ(x)) − x‖ on a grid over the demonstrations' box grown by half its size on every
-    side, computed here, not taken from the fit.
-
-With ``--leave-one-out`` each demonstration is also followed by the motion learned from the others, and by two ways that
-need no learning (see `dt_viz.evaluate.held_out`): SHAPE-held-out.npz holds ``learned_i``, ``mean_i`` and ``nearest_i``
-(T, d) for each demonstration i, and ``learned_times_i`` … (T,); of demonstrations with the hand's orientation also
-``learned_degrees_i`` and ``mean_degrees_i`` (N,), its angles from the demonstration's. ``figures.json`` holds what the
-tables show, ``shapes.png`` all shapes (the paper's fig. 5), and ``worst.png`` the held-out demonstrations that are met
-worst for the extent of their shape.
-"""
+"""Fit demonstrations and compare each rollout with its own demonstration, in-sample or left out."""
 
 from __future__ import annotations
 
 import argparse
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
 from statistics import geometric_mean
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from dt_viz.errors import FormatError
-from dt_viz.evaluate.held_out import (
-    WAYS,
-    Followed,
-    Learn,
-    degrees_off,
-    folds_of,
-    follow_held,
-    frechet,
-    in_order,
-    rollouts_from,
-)
-from dt_viz.evaluate.options import FOLDER, report, whole_number, write_json, write_npz
-from dt_viz.evaluate.sweep import add_workers, sweep
+from dt_viz.evaluate.held_out import WAYS, Followed, Learn, degrees_off, folds_of, follow, frechet, rollouts_from
+from dt_viz.evaluate.options import add_workers, computed, output, report, whole_number, write_json, write_npz
 from dt_viz.files.archives import LASA_UNITS
 from dt_viz.flows.diffeomorphisms import min_det_jacobian, round_trip_error
 from dt_viz.flows.fields import Array
@@ -62,19 +29,17 @@ from dt_viz.metrics import rms_at_equal_times
 from dt_viz.pictures import figures
 from dt_viz.pictures.figures import FigurePanel
 
-OUT = FOLDER
 STATES = ("plain", "augmented", "auto")
+NUM_WORST = 9  # of the held-out demonstrations are drawn
 
 
-@dataclass(frozen=True)
-class Source:
+class Source(NamedTuple):
     """The demonstrations of one file."""
 
     path: Path
-    demonstrations: tuple[Demonstration, ...]
-    """Demonstrations in metres."""
-    unit: float
-    """Length of one unit of the file, metres."""
+    demonstrations: tuple[Demonstration, ...]  # in metres
+    unit: float  # length of one unit of the file, metres
+    folds: Sequence[range]  # numbers of the demonstrations that each fold holds out
 
     @property
     def paths(self) -> list[Array]:
@@ -87,6 +52,17 @@ class Source:
         return float(np.ptp(np.concatenate(self.paths), axis=0).max())
 
 
+class InSample(NamedTuple):
+    """The motions learned from all demonstrations of a source."""
+
+    row: dict[str, Any]  # of the table
+    arrays: dict[str, Any]  # of the file
+    rollouts: Array  # (N, T, d) from each demonstration's start, metres
+    degrees: Sequence[Array]  # from the orientation of each demonstration, see `degrees_off`; empty without any
+    choice: str  # state that was chosen, and why; empty where it was asked for
+    warnings: Sequence[str]
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the command's arguments."""
     parser.add_argument("files", type=Path, nargs="+", metavar="SHAPE", help="file or folder of demonstrations")
@@ -95,8 +71,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--objective", choices=OBJECTIVES, default=OBJECTIVES[0], help="default: %(default)s")
     parser.add_argument("--state", choices=STATES, default=STATES[0], help="default: %(default)s")
     parser.add_argument("--leave-one-out", action="store_true", help="also follow each by what the others teach")
-    folds = "the same, but hold out in so many folds"
-    parser.add_argument("--folds", type=whole_number(2), metavar="N", help=folds)
+    parser.add_argument("--folds", type=whole_number(2), metavar="N", help="the same, held out in so many folds")
+    parser.add_argument("--out", type=output(), required=True, metavar="DIR", help="folder of what is written")
     add_workers(parser)
 
 
@@ -104,67 +80,64 @@ def run(options: argparse.Namespace) -> int:
     """Run the command; 2 if one of the shapes could not be fitted."""
     if options.state == "augmented" and options.objective != OBJECTIVES[0]:
         raise FormatError("--objective", options.objective, "none with --state augmented, whose fit has no objective")
-    sources = _sources(options.files, options.rate, options.unit)
-    holds_out = options.leave_one_out or options.folds is not None
-    alone = ", ".join(str(source.path) for source in sources if len(source.demonstrations) == 1)
-    if holds_out and alone:
-        raise FormatError("--leave-one-out", f"one demonstration only in {alone}", "two or more in each")
-    folder = options.out
-    shapes: list[dict[str, Any]] = []
-    held_out: list[dict[str, Any]] = []
-    turns: list[dict[str, Any]] = []
-    panels: list[FigurePanel] = []
-    cases: list[tuple[float, FigurePanel]] = []
-    for source, folds, in_sample, parts in _learned(sources, holds_out, options):
-        name = source.path.stem
-        if error := next((part for part in (in_sample, *parts) if isinstance(part, ImitationError)), None):
+    sources, folder = _sources(options), options.out
+    learn: Learn = partial(learn_in_state, settings=ImitationSettings(options.objective), state=options.state)
+    cases = [(source, held) for source in sources for held in (None, *source.folds)]
+    found = computed(options, partial(_measured, learn), cases)
+    shapes, held_out, turns, panels, worst = [], [], [], [], []
+    for source in sources:
+        name, parts = source.path.stem, [*islice(found, 1 + len(source.folds))]
+        if error := next((part for part in parts if isinstance(part, ImitationError)), None):
             print(f"{source.path}: {error}", file=sys.stderr)
             continue
-        followed = in_order(parts)
-        if in_sample.choice:
-            print(f"{name}: {in_sample.choice}")
-        for warning in in_sample.warnings:
+        own, followed = parts[0], sorted((f for part in parts[1:] for f in part), key=lambda f: f.number)
+        if own.choice:
+            print(f"{name}: {own.choice}")
+        for warning in own.warnings:
             print(f"{source.path}: {warning}", file=sys.stderr)
-        shapes.append(in_sample.row)
-        write_npz(folder / f"{name}.npz", **in_sample.arrays)
-        panels.append(FigurePanel(name, {"demonstration": source.paths, "learned": in_sample.rollouts}))
-        if in_sample.degrees:
-            turns.append(turn_row(name, in_sample.degrees, followed))
-        if holds_out:
-            write_npz(folder / f"{name}-held-out.npz", **_arrays(followed, source.unit))
-            held_out.append(summed_up(name, folds, followed))
-            cases += cases_of(source, followed)
+        shapes.append(own.row)
+        write_npz(folder / f"{name}.npz", own.arrays)
+        panels.append(FigurePanel(name, {"demonstration": source.paths, "learned": own.rollouts}))
+        if own.degrees:
+            turns.append(turn_row(name, own.degrees, followed))
+        if followed:
+            write_npz(folder / f"{name}-held-out.npz", _arrays(followed, source.unit))
+            held_out.append(summed_up(name, len(source.folds), followed))
+            worst += [_panel(source, one) for one in followed]
     if shapes:
         _report(shapes, held_out, turns)
-        chosen = {"state": options.state, "objective": options.objective}
-        write_json(folder / "figures.json", {**chosen, "shapes": shapes, "held_out": held_out, "turns": turns})
+        written = {"state": options.state, "objective": options.objective, "shapes": shapes}
+        write_json(folder / "figures.json", written | {"held_out": held_out, "turns": turns})
     if shapes and figures.can_draw():
         figures.save(figures.panels(panels), folder / "shapes.png")
-        if worst := worst_of(cases):
-            figures.save(figures.panels([panel for _, panel in worst], columns=3), folder / "worst.png")
+        worst = [panel for _, panel in sorted(worst, key=lambda case: -case[0])[:NUM_WORST]]
+        if worst:
+            figures.save(figures.panels(worst, columns=3), folder / "worst.png")
     return 0 if len(shapes) == len(sources) else 2
 
 
-def _learned(
-    sources: Sequence[Source], holds_out: bool, options: argparse.Namespace
-) -> Iterator[tuple[Source, int, Any, Sequence[Any]]]:
-    """Each source with its number of folds, its `InSample`, and what each fold has followed; or the errors of these."""
-    folds = [min(options.folds or num, num) for num in (len(source.demonstrations) for source in sources)]
-    held = [folds_of(len(s.demonstrations), of) if holds_out else [] for s, of in zip(sources, folds, strict=True)]
-    cases = [(source, part) for source, parts in zip(sources, held, strict=True) for part in (None, *parts)]
-    learn: Learn = partial(learn_in_state, settings=ImitationSettings(options.objective), state=options.state)
-    with sweep(options, lambda: learn) as (_, swept):
-        found = swept(_measured, cases)
-        for source, of, parts in zip(sources, folds, held, strict=True):
-            yield source, of, next(found), [*islice(found, len(parts))]
+def _sources(options: argparse.Namespace) -> list[Source]:
+    sources: dict[str, Source] = {}
+    for path in options.files:
+        if path.stem in sources:
+            found = f"{str(sources[path.stem].path)!r} and {str(path)!r}, which would both become {path.stem}.npz"
+            raise FormatError("SHAPE", found, "files of different names")
+        demonstrations = load_demonstrations(path, rate=options.rate, unit=options.unit)
+        num = len(demonstrations) if options.leave_one_out or options.folds else 0
+        if num == 1:
+            raise FormatError("--leave-one-out", f"one demonstration only in {path}", "two or more in each")
+        folds = folds_of(num, min(options.folds or num, num))
+        unit = LASA_UNITS["length"] if path.suffix.lower() == ".mat" else 1.0
+        sources[path.stem] = Source(path, demonstrations, unit, folds)
+    return list(sources.values())
 
 
-def _measured(learn: Learn, case: tuple[Source, range | None]) -> InSample | dict[int, Followed] | ImitationError:
-    """Learn from a source and follow what is learned from, or, of a fold, what is held out; an error is a result."""
+def _measured(learn: Learn, case: tuple[Source, range | None]) -> Any:  # noqa: ANN401 - one of three
+    """Learn from a source; return its `InSample`, or of a fold what it has `Followed`; or an ImitationError."""
     source, held = case
     try:
         if held is not None:
-            return follow_held(source.demonstrations, learn, held)
+            return follow(source.demonstrations, learn, held)
         began = time.perf_counter()
         imitation = learn(source.demonstrations)
         return in_sample(imitation, source, time.perf_counter() - began)
@@ -172,91 +145,36 @@ def _measured(learn: Learn, case: tuple[Source, range | None]) -> InSample | dic
         return error
 
 
-def _report(shapes: list[dict[str, Any]], held_out: list[dict[str, Any]], turns: list[dict[str, Any]]) -> None:
-    """Print the rows of `in_sample`, `summed_up` and `turn_row`, and how what was learned fares beside what is not."""
-    print("in-sample: each rollout against the demonstration that it was learned from")
-    report(_with_means(shapes))
-    print(f"fit, median: {np.median([row['fit_seconds'] for row in shapes]):.2f} s")
-    if held_out:
-        print("\nheld out: each demonstration against what was learned from the others")
-        report(_with_means(held_out))
-        better = sum(row["learned_mm"] < min(row["mean_mm"], row["nearest_mm"]) for row in held_out)
-        ratios = [row["of_mean"] for row in held_out]
-        print(f"nearer than both without learning: {better} of {len(held_out)}")
-        print(
-            f"relative to the mean, shifted: {geometric_mean(ratios):.3f} (geometric mean), {max(ratios):.3f} at worst"
-        )
-    if turns:
-        print("\nthe hand's orientation, degrees from the demonstration's at equal parts of the way")
-        report(_with_means(turns))
-
-
-@dataclass(frozen=True)
-class InSample:
-    """What was learned from all demonstrations of a source, followed."""
-
-    row: dict[str, Any]
-    """Row of the table."""
-    arrays: dict[str, Any]
-    """Arrays of the file."""
-    rollouts: tuple[Array, ...]
-    """(T, d) from each demonstration's start, metres."""
-    degrees: Sequence[Array]
-    """Angles from the orientation of each demonstration, see `degrees_off`; empty without orientations."""
-    choice: str
-    """State that was chosen, and why; empty where it was asked for."""
-    warnings: Sequence[str]
-
-
 def in_sample(imitation: AnyImitation, source: Source, fit_seconds: float) -> InSample:
     """Follow all demonstrations."""
-    paths, unit = source.paths, source.unit
+    paths, unit, demonstrations = source.paths, source.unit, source.demonstrations
     rollouts, times = rollouts_from(imitation, np.stack([path[0] for path in paths]))
     distances = 1e3 * frechet(list(rollouts), paths)
-    at_times = zip(times, rollouts, source.demonstrations, strict=True)
-    rms = [1e3 * rms_at_equal_times(t, rollout, d.times, d.positions) for t, rollout, d in at_times]
+    at_times = zip(times, rollouts, demonstrations, strict=True)
     grid, transform = _states(imitation, paths), imitation.system.transform
     round_trip, det = round_trip_error(transform, grid), min_det_jacobian(transform.jacobian, grid)
-    start_seconds = float(np.median([_seconds_for(imitation, path[0]) for path in paths]))
+    seconds = {
+        "fit_seconds": fit_seconds,
+        "start_seconds": float(np.median([_seconds_for(imitation, path[0]) for path in paths])),
+    }
     row = {
         "name": source.path.stem,
         "demonstrations": len(paths),
         "frechet_mean_mm": float(distances.mean()),
         "frechet_max_mm": float(distances.max()),
-        "rms_mm": float(np.mean(rms)),
-        "fit_seconds": fit_seconds,
-        "start_seconds": start_seconds,
+        "rms_mm": float(np.mean([1e3 * rms_at_equal_times(t, x, d.times, d.positions) for t, x, d in at_times])),
+        **seconds,
         "end_error_mm": 1e3 * float(np.linalg.norm(rollouts[:, -1] - imitation.goal, axis=1).max()),
         "round_trip_of_extent": round_trip / source.extent,
         "min_det_jacobian": det,
     }
-    arrays = {
-        "fit_seconds": fit_seconds,
-        "start_seconds": start_seconds,
-        "min_det_jacobian": det,
-        "round_trip_error": round_trip / unit,
-        "goal": imitation.goal / unit,
-        **{f"rollout_{i}": rollout / unit for i, rollout in enumerate(rollouts)},
-        **{f"times_{i}": moments for i, moments in enumerate(times)},
-    }
-    demonstrations, turned = source.demonstrations, imitation.has_orientation
-    degrees = [degrees_off(imitation, demonstrations, each)["learned"] for each in demonstrations] if turned else []
+    arrays = {**seconds, "min_det_jacobian": det, "round_trip_error": round_trip / unit, "goal": imitation.goal / unit}
+    for i, (rollout, moments) in enumerate(zip(rollouts, times, strict=True)):
+        arrays |= {f"rollout_{i}": rollout / unit, f"times_{i}": moments}
+    turned = demonstrations if imitation.has_orientation else ()
+    degrees = [degrees_off(imitation, demonstrations, each)["learned"] for each in turned]
     choice = "" if imitation.choice is None else f"{imitation.state}. {imitation.choice}"
-    return InSample(row, arrays, tuple(rollouts), degrees, choice, imitation.warnings)
-
-
-def turn_row(name: str, degrees: Sequence[Array], followed: Sequence[Followed]) -> dict[str, float | str]:
-    """Row of the table of orientations: medians and largest angles in-sample, held out, and of the mean of the others.
-
-    All over the samples of all demonstrations, degrees.
-    """
-    angles = {"in_sample": degrees}
-    if followed:
-        angles |= {"held_out": [f.degrees["learned"] for f in followed]}
-        angles |= {"mean_of_others": [f.degrees["mean"] for f in followed]}
-    over = {"median": np.median, "largest": np.max}
-    values = {f"{title}_{name}": float(of(off)) for title, off in angles.items() for name, of in over.items()}
-    return {"name": name, **values}
+    return InSample(row, arrays, rollouts, degrees, choice, imitation.warnings)
 
 
 def _states(imitation: AnyImitation, paths: Sequence[Array]) -> Array:
@@ -272,7 +190,7 @@ def _states(imitation: AnyImitation, paths: Sequence[Array]) -> Array:
 
 
 def _seconds_for(imitation: AnyImitation, start: Array) -> float:
-    """Measure how long the motion from a start (d,) takes to be known, by one that has kept nothing."""
+    """Measure how long the motion from a start (d,) takes to be known, by a copy that has kept nothing."""
     began = time.perf_counter()
     system = replace(imitation).system
     system.base.velocity(system.transform.forward(system.base.states(start)))
@@ -280,18 +198,30 @@ def _seconds_for(imitation: AnyImitation, start: Array) -> float:
 
 
 def _arrays(followed: Sequence[Followed], unit: float) -> dict[str, Array]:
-    """Arrays of the file of what was held out; lengths in so many metres."""
-    arrays = {f"{way}_degrees_{i}": off for i, f in enumerate(followed) for way, off in f.degrees.items()}
-    for i, f in enumerate(followed):
-        for way, (path, times) in f.motions.items():
-            arrays |= {f"{way}_{i}": path / unit, f"{way}_times_{i}": times}
+    """Arrays of the file of held-out demonstrations; lengths in units of so many metres."""
+    arrays: dict[str, Array] = {}
+    for f in followed:
+        arrays |= {f"{way}_degrees_{f.number}": off for way, off in f.degrees.items()}
+        arrays |= {f"{way}_{f.number}": path / unit for way, (path, _) in f.motions.items()}
+        arrays |= {f"{way}_times_{f.number}": times for way, (_, times) in f.motions.items()}
     return arrays
+
+
+def turn_row(name: str, degrees: Sequence[Array], followed: Sequence[Followed]) -> dict[str, float | str]:
+    """Row of the table of orientations: median and largest angles over all samples of all demonstrations, degrees."""
+    angles = {"in_sample": degrees}
+    if followed:
+        angles |= {"held_out": [f.degrees["learned"] for f in followed]}
+        angles |= {"mean_of_others": [f.degrees["mean"] for f in followed]}
+    over = {"median": np.median, "largest": np.max}
+    values = {f"{title}_{name}": float(of(off)) for title, off in angles.items() for name, of in over.items()}
+    return {"name": name, **values}
 
 
 def summed_up(name: str, folds: int, followed: Sequence[Followed]) -> dict[str, Any]:
     """Means over the held-out demonstrations of a shape, mm: Fréchet distance and distance at equal times.
 
-    ``of_mean`` is the Fréchet distance of what was learned relative to that of the mean, shifted, and ``plain`` the
+    ``of_mean`` is the Fréchet distance of the learned motion relative to that of the mean, shifted, and ``plain`` the
     part of the demonstrations that was followed in the plain state.
     """
     distances = {f"{way}_mm": 1e3 * float(np.mean([f.frechet(way) for f in followed])) for way in WAYS}
@@ -301,38 +231,36 @@ def summed_up(name: str, folds: int, followed: Sequence[Followed]) -> dict[str, 
     return {"name": name, "folds": folds, **distances, "of_mean": of_mean, "plain": plain, **rms}
 
 
-def cases_of(source: Source, followed: Sequence[Followed]) -> list[tuple[float, FigurePanel]]:
-    """The panel of each held-out demonstration, and how far off what was learned is, relative to the extent."""
-    cases, paths = [], source.paths
-    for i, f in enumerate(followed):
-        learned, mean, nearest = (1e3 * f.frechet(way) for way in WAYS)
-        kinds = {
-            "learned from": [*paths[:i], *paths[i + 1 :]],
-            "demonstration": [paths[i]],
-            "learned": [f.motions["learned"][0]],
-            "mean, shifted": [f.motions["mean"][0]],
-            "nearest start, shifted": [f.motions["nearest"][0]],
-        }
-        title = f"{source.path.stem} {i + 1}  {learned:.1f} mm\nmean {mean:.1f}, nearest {nearest:.1f} mm"
-        cases.append((learned / source.extent, FigurePanel(title, kinds)))
-    return cases
+def _panel(source: Source, f: Followed) -> tuple[float, FigurePanel]:
+    """The panel of a held-out demonstration, and how far off the learned motion is, relative to the extent."""
+    learned, mean, nearest = (1e3 * f.frechet(way) for way in WAYS)
+    kinds = {
+        "learned from": [path for i, path in enumerate(source.paths) if i != f.number],
+        "demonstration": [f.demonstration.positions],
+        "learned": [f.motions["learned"][0]],
+        "mean, shifted": [f.motions["mean"][0]],
+        "nearest start, shifted": [f.motions["nearest"][0]],
+    }
+    title = f"{source.path.stem} {f.number + 1}  {learned:.1f} mm\nmean {mean:.1f}, nearest {nearest:.1f} mm"
+    return learned / source.extent, FigurePanel(title, kinds)
 
 
-def worst_of(cases: Sequence[tuple[float, FigurePanel]], num: int = 9) -> list[tuple[float, FigurePanel]]:
-    """The cases in which what was learned is farthest off, the worst first."""
-    return sorted(cases, key=lambda case: -case[0])[:num]
-
-
-def _sources(paths: Sequence[Path], rate: float | None, unit: str | None) -> list[Source]:
-    """Read all files."""
-    sources: dict[str, Source] = {}
-    for path in paths:
-        if path.stem in sources:
-            found = f"{str(sources[path.stem].path)!r} and {str(path)!r}, which would both become {path.stem}.npz"
-            raise FormatError("SHAPE", found, "files of different names")
-        size = LASA_UNITS["length"] if path.suffix.lower() == ".mat" else 1.0
-        sources[path.stem] = Source(path, load_demonstrations(path, rate=rate, unit=unit), size)
-    return list(sources.values())
+def _report(shapes: list[dict[str, Any]], held_out: list[dict[str, Any]], turns: list[dict[str, Any]]) -> None:
+    """Print the rows of `in_sample`, `summed_up` and `turn_row`, and how the learned motions fare beside the others."""
+    print("in-sample: each rollout against the demonstration that it was learned from")
+    report(_with_means(shapes))
+    print(f"fit, median: {np.median([row['fit_seconds'] for row in shapes]):.2f} s")
+    if held_out:
+        print("\nheld out: each demonstration against what was learned from the others")
+        report(_with_means(held_out))
+        better = sum(row["learned_mm"] < min(row["mean_mm"], row["nearest_mm"]) for row in held_out)
+        ratios = [row["of_mean"] for row in held_out]
+        mean, worst = geometric_mean(ratios), max(ratios)
+        print(f"nearer than both without learning: {better} of {len(held_out)}")
+        print(f"relative to the mean, shifted: {mean:.3f} (geometric mean), {worst:.3f} at worst")
+    if turns:
+        print("\nthe hand's orientation, degrees from the demonstration's at equal parts of the way")
+        report(_with_means(turns))
 
 
 def _with_means(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -5,11 +5,14 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import re
-import time
-from collections.abc import Callable, Mapping, Sequence
+import os
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
+from uuid import uuid4
 
 import numpy as np
 
@@ -21,47 +24,27 @@ from dt_viz.scenario.tasks import TASKS, Task, TaskEntry, known_tasks
 from dt_viz.session.engine import Engine
 from dt_viz.session.tasks_in_reach import in_reach
 
-Row = Mapping[str, str | float | None]
-"""Row of a table: text or number of each column by its header, which names the unit."""
-FOLDER = "DIR"
-"""What a command's `OUT` is where it writes several files."""
-TABLES = "TABLES"
-"""What a command's `OUT` is where it writes nothing but what it prints."""
-PRINTED: list[Sequence[Row]] = []
-"""Tables that the running command has printed."""
+Row = Mapping[str, str | float | None]  # text or number of each column by its header, which names the unit
+PRINTED: list[Sequence[Row]] = []  # tables that the running command has printed
 
 
 def add_task(parser: argparse.ArgumentParser) -> None:
-    """Add `--task` and `--lasa`."""
+    """Define `--task` and `--lasa`."""
     parser.add_argument("--task", required=True, help=f"{', '.join(TASKS)}, or a file of --lasa without its suffix")
-    add_lasa(parser)
-
-
-def add_lasa(parser: argparse.ArgumentParser) -> None:
-    """Add `--lasa`."""
     parser.add_argument("--lasa", type=Path, metavar="DIR", help="folder of LASA .mat files, each becomes a task")
 
 
-def chosen_task(options: argparse.Namespace) -> tuple[Mapping[str, TaskEntry], Task]:
-    """Return all tasks by name, and the chosen one, loaded.
-
-    Raises:
-        FormatError: there is none of this name.
-        DemonstrationError: the folder or the task's file cannot be used.
-    """
+def chosen_task(options: argparse.Namespace) -> Task:
+    """Load the chosen task. Raises FormatError if there is none of this name, DemonstrationError if it is unusable."""
     tasks = known_tasks(options.lasa)
     if options.task not in tasks:
         hint = "" if options.lasa is not None else "; --lasa DIR adds more"
         raise FormatError("--task", repr(options.task), ", ".join(tasks) + hint)
-    return tasks, tasks[options.task]()
+    return tasks[options.task]()
 
 
 def new_engine(tasks: Mapping[str, TaskEntry], arm: str = "jaco") -> Engine:
-    """Return an engine that has computed nothing yet, with what was learned before on this machine, tasks in reach.
-
-    Raises:
-        ArmError: there is no such arm.
-    """
+    """Return an engine that has computed nothing yet, with what was learned before on this machine, tasks in reach."""
     robot = load_arm(arm)
     return Engine(in_reach(tasks, robot), FitStore(default_cache_folder()), robot)
 
@@ -71,134 +54,87 @@ def engine_of(task: Task) -> Engine:
     return new_engine({task.name: TaskEntry(task.title, lambda: task)})
 
 
-def whole_number(minimum: int, maximum: int | None = None) -> Callable[[str], int]:
-    """Return a type for argparse: a whole number of at least `minimum`, which is not negative, and up to `maximum`."""
-    to = "or more" if maximum is None else f"to {maximum}"
+def numbers(
+    accepted: str, minimum: float, maximum: float, *counts: int, kind: type[float] = float
+) -> Callable[[str], tuple[Any, ...]]:
+    """Return a type for argparse: numbers within bounds, with commas between; as many as one of `counts`, or one."""
 
-    def convert(text: str) -> int:
-        number = int(text) if text.isdecimal() else -1
-        if number < minimum or (maximum is not None and number > maximum):
-            raise argparse.ArgumentTypeError(f"found {text!r}; accepted: a whole number, {minimum} {to}")
-        return number
+    def convert(text: str) -> tuple[float, ...]:
+        try:
+            found = tuple(map(kind, text.split(",")))
+        except ValueError:
+            found = ()
+        if len(found) not in (counts or (1,)) or not all(minimum <= number <= maximum for number in found):
+            raise argparse.ArgumentTypeError(f"found {text.strip()!r}; accepted: {accepted}")
+        return found
 
     return convert
+
+
+def whole_number(minimum: int) -> Callable[[str], int]:
+    """Return a type for argparse: a whole number of at least `minimum`."""
+    convert = numbers(f"a whole number, {minimum} or more", minimum, math.inf, kind=int)
+    return lambda text: convert(text)[0]
 
 
 def positive_number(unit: str, maximum: float) -> Callable[[str], float]:
     """Return a type for argparse: a number above 0 and up to `maximum`."""
-    return number(unit, math.ulp(0), maximum)
-
-
-def number(unit: str, minimum: float, maximum: float) -> Callable[[str], float]:
-    """Return a type for argparse: a number between two others."""
-    least = "more than 0" if minimum == math.ulp(0) else f"at least {minimum:g}"
-    return lambda text: _numbers(text, (1,), f"{unit}, {least} and at most {maximum:g}", minimum, maximum)[0]
+    convert = numbers(f"{unit}, more than 0 and at most {maximum:g}", math.ulp(0), maximum)
+    return lambda text: convert(text)[0]
 
 
 def interval(minimum: float, maximum: float) -> Callable[[str], tuple[float, float]]:
     """Return a type for argparse: LOW,HIGH within bounds, or one number for both."""
-    accepted = f"a number or LOW,HIGH, at least {minimum:g} and at most {maximum:g}"
+    convert = numbers(f"a number or LOW,HIGH, at least {minimum:g} and at most {maximum:g}", minimum, maximum, 1, 2)
+    return lambda text: (min(found := convert(text)), max(found))
 
-    def convert(text: str) -> tuple[float, float]:
-        low, *_, high = 2 * _numbers(text, (1, 2), accepted, minimum, maximum)
-        if low > high:
-            raise argparse.ArgumentTypeError(f"found {text!r}; accepted: {accepted}")
-        return low, high
+
+def output(suffix: str = "") -> Callable[[str], Path]:
+    """Return a type for argparse: the path of a file with a suffix, or of a folder, that can be written."""
+
+    def convert(text: str) -> Path:
+        path = Path(text)
+        there = next(each for each in (path, *path.absolute().parents) if each.exists())
+        is_whole = suffix in ("", path.suffix) and there.is_dir() == (not suffix or there != path)
+        if not is_whole or not os.access(there, os.W_OK):
+            kind = f"a file that ends in {suffix} and can be written" if suffix else "a folder that can be written to"
+            raise argparse.ArgumentTypeError(f"found {text!r}; accepted: {kind}")
+        return path
 
     return convert
 
 
-def point(text: str) -> tuple[float, float, float]:
-    """Convert X,Y,Z, metres; a type for argparse."""
-    x, y, z = _numbers(text, (3,), "three numbers X,Y,Z in metres, such as 0,-0.5,0.4", -1e9, 1e9)
-    return x, y, z
-
-
-def with_negative_values(arguments: Sequence[str]) -> list[str]:
-    """Join an option to a value such as -0.1,-0.5,0.4, which argparse would take for an option."""
-    joined: list[str] = []
-    for argument in arguments:
-        if re.match(r"-[\d.]", argument) and joined and re.fullmatch(r"--[^=]+", joined[-1]):
-            joined[-1] += f"={argument}"
-        else:
-            joined.append(argument)
-    return joined
-
-
-def ready_to_write(path: Path, form: str) -> Path:
-    """Check, before minutes of measuring, that a file can be written, and make its folder.
-
-    Args:
-        path: the file, or folder.
-        form: `FOLDER`, or "FILE" with the suffix that it has to have.
-
-    Raises:
-        FormatError: it has another suffix, is a folder where a file is wanted, or cannot be written.
-    """
-    suffix = "" if form == FOLDER else Path(form).suffix
-    if path.suffix.lower() != suffix and form != FOLDER:
-        raise FormatError("--out", repr(str(path)), f"a file that ends in {suffix}")
-    try:
-        (path.parent if suffix else path).mkdir(parents=True, exist_ok=True)
-        if suffix and not path.exists():
-            path.touch()
-            path.unlink()
-        elif suffix:
-            path.open("ab").close()
-    except OSError as error:
-        found = f"{str(path)!r}, which cannot be written ({error.strerror or error})"
-        raise FormatError("--out", found, "a file or folder that can be written") from error
-    return path
-
-
 def write_json(path: Path, values: Mapping[str, Any]) -> None:
     """Write figures as standard JSON, without NaN."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(values, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
-def write_npz(path: Path, **arrays: Any) -> None:  # noqa: ANN401 - numbers and arrays
-    """Write arrays to an npz file of exactly this name."""
-    with path.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **arrays)
+def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Write numbers and arrays."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(path, **arrays)
 
 
-def unit_ms() -> float:
-    """Measure a fixed piece of numpy work: 3,000 calls of exp and einsum on small arrays, the best of ten, ms."""
-    rows, best = np.linspace(-1, 1, 24).reshape(8, 3), np.inf
-    for _ in range(10):
-        began = time.perf_counter()
-        for _ in range(1500):
-            np.einsum("ij,ij->i", rows, np.exp(rows))
-        best = min(best, time.perf_counter() - began)
-    return 1e3 * best
-
-
-def report(rows: Sequence[Row], *, markdown: bool = False) -> None:
+def report(rows: Sequence[Row]) -> None:
     """Print rows, if there are any, as a table whose header is the columns of the first, aligned left, then right."""
     if not rows:
         return
     PRINTED.append([{column: row.get(column) for column in rows[0]} for row in rows])
     texts = [[*rows[0]], *([as_text(cell) for cell in row.values()] for row in PRINTED[-1])]
     first, *widths = (max(map(len, column)) for column in zip(*texts, strict=True))
-    aligned = [[name.ljust(first), *map(str.rjust, cells, widths)] for name, *cells in texts]
-    if markdown:
-        aligned.insert(1, ["-" * first, *("-" * (width - 1) + ":" for width in widths)])
-    for cells in aligned:
-        print(f"| {' | '.join(cells)} |" if markdown else "  ".join(cells).rstrip())
+    for name, *cells in texts:
+        print("  ".join([name.ljust(first), *map(str.rjust, cells, widths)]).rstrip())
 
 
 def write_tables(path: Path) -> None:
     """Write all tables that were printed to a JSON file: lists of rows; null for what is no number."""
-    finite = [[{name: _finite(cell) for name, cell in row.items()} for row in rows] for rows in PRINTED]
-    write_json(path, {"tables": finite})
-
-
-def _finite(cell: str | float | None) -> str | float | None:
-    return None if isinstance(cell, float) and not math.isfinite(cell) else cell
+    finite = lambda cell: None if isinstance(cell, float) and not math.isfinite(cell) else cell  # noqa: E731
+    write_json(path, {"tables": [[{name: finite(row[name]) for name in row} for row in rows] for rows in PRINTED]})
 
 
 def as_text(value: str | float | None) -> str:
-    """Text of a cell: three digits of a number; a dash where there is none."""
+    """Return the text of a cell: three digits of a number; a dash where there is none."""
     if value is None or value != value:  # noqa: PLR0124 - NaN
         return "–"
     if isinstance(value, float):
@@ -206,12 +142,55 @@ def as_text(value: str | float | None) -> str:
     return str(value)
 
 
-def _numbers(text: str, counts: tuple[int, ...], accepted: str, minimum: float, maximum: float) -> list[float]:
-    """Convert so many numbers between bounds, separated by commas."""
-    try:
-        numbers = [float(part) for part in text.split(",")]
-    except ValueError:
-        numbers = []
-    if len(numbers) not in counts or not all(minimum <= number <= maximum for number in numbers):
-        raise argparse.ArgumentTypeError(f"found {text!r}; accepted: {accepted}")
-    return numbers
+INSTALL = 'pip install "dt-viz[sweeps]"'
+PATIENCE = 5.0  # s within which a Dask scheduler has to answer
+T = TypeVar("T")
+_made = threading.local()
+
+
+@dataclass(frozen=True)
+class Made(Generic[T]):
+    """A value, such as an engine, that each worker thread makes once, as it is not sent."""
+
+    make: Callable[[], T]
+    key: str = field(default_factory=lambda: uuid4().hex)
+
+    def __call__(self) -> T:
+        """Return the value of this thread."""
+        if getattr(_made, "key", None) != self.key:
+            _made.value, _made.key = self.make(), self.key
+        return _made.value
+
+
+def add_workers(parser: argparse.ArgumentParser) -> None:
+    """Define `--jobs` and `--dask`."""
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--jobs", type=whole_number(1), default=1, metavar="N", help="processes (default: %(default)s)")
+    where.add_argument("--dask", metavar="ADDRESS", help="scheduler of a Dask cluster that computes instead")
+
+
+def computed(options: argparse.Namespace, function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
+    """Yield the results of a function, in the order of its items.
+
+    Raises FormatError if joblib or distributed is not installed, or no scheduler answers.
+    """
+    if options.dask is None and options.jobs == 1:
+        yield from map(function, items)
+        return
+    with ExitStack() as stack:
+        try:
+            from joblib import Parallel, delayed, parallel_config  # noqa: PLC0415 - an extra
+
+            if options.dask is not None:
+                from distributed import Client  # noqa: PLC0415 - an extra
+
+                stack.enter_context(Client(options.dask, timeout=PATIENCE))
+                stack.enter_context(parallel_config("dask"))
+        except ImportError as error:
+            option = "--jobs" if options.dask is None else "--dask"
+            raise FormatError(option, f"{error.name} not installed", f"--jobs 1, or more after {INSTALL}") from error
+        except (OSError, ValueError) as error:
+            found, accepted = f"{options.dask!r}, where no scheduler answers", "such as tcp://127.0.0.1:8786"
+            raise FormatError("--dask", found, f"the address of a Dask scheduler, {accepted}") from error
+        jobs = options.jobs if options.dask is None else None
+        yield from Parallel(jobs, return_as="generator")(delayed(function)(item) for item in items)

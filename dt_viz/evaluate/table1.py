@@ -1,70 +1,31 @@
 """Compare all methods, around a sphere at seeded places of the paper's three tasks (Table 1 and figure 6).
 
-    python -m dt_viz.evaluate table1 --out DIR
-
 Places: a sphere of 15 cm is centred up to 5 cm from the mean demonstration, between a fifth and four fifths of its
 length. Those places are kept where the hand of every undisturbed motion enters it, and where the arm's meshes are free
-in its usual posture at every start and goal of the demonstrations: each method has a problem that can be solved.
-
-``DIR/table1.json`` holds ``{method: {task: {column: {"mean", "worst", "paper"}}}}`` in metres and seconds, over all
-places and rollouts; ``paper`` is the paper's value, null where there is none. ``DIR/METHOD_TASK.npz`` holds what
-the cells are made from: ``obstacle_k`` (4,), centre and diameter of the sphere at place k; ``x_k_i``, ``t_k_i`` and
-``q_k_i``, the path (N, 3), its times (N,) and the arm's postures (M, n) along it, of the rollout from start i;
-``demo_i`` (T, 3), its demonstration, and ``demo_t_i``; one array (K, R) for each column, of motions from the starts;
-``perturbed_k`` (P, 3) and ``ends_k`` (P, 3), perturbed starts and where their motions end. Columns:
-
-``frechet``, ``dtw``
-    discrete Fréchet distance of the hand's path to the demonstration, between 400 points each; and mean distance of
-    points matched by dynamic time warping, between 200 points each, all evenly by arc length.
-``arm_depth``, ``hand_depth``, ``clearance``
-    maximum collision distance of the arm's meshes and of the end effector, and the meshes' smallest distance.
-``goal_error``, ``turn``, ``jerk``
-    distance of the end from the demonstrations' goal; sharpest turn over `TURN_ARC`, degrees; root mean square of
-    the third derivative at 20 Hz, m/s³.
-``reached``
-    share of motions from perturbed starts that end within 1 cm of the goal; worst is that of a place.
-``seconds``
-    processor time to plan all motions of a place, without tracking them.
-
-Hand paths are tracked by the arm, in its usual posture, for what is measured of the meshes.
+in its usual posture at every start and goal of the demonstrations: each method has a problem that can be solved. Hand
+paths are tracked by the arm, in its usual posture, for the figures of the meshes.
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cache
+from collections.abc import Mapping, Sequence
+from functools import cache, partial
 from itertools import islice
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from dt_viz.baselines.base import INSTALL, Method, NotFittedError, Plan, Planner, Problem
+from dt_viz import metrics
+from dt_viz.baselines.base import INSTALL, NotFittedError, Plan, Planner, Problem
 from dt_viz.baselines.registry import METHODS, problem_of
 from dt_viz.errors import FormatError
+from dt_viz.evaluate import options as shared
 from dt_viz.evaluate.around import TURN_ARC, in_ball
 from dt_viz.evaluate.held_out import frechet
-from dt_viz.evaluate.options import (
-    FOLDER,
-    Row,
-    new_engine,
-    report,
-    whole_number,
-    write_json,
-    write_npz,
-)
-from dt_viz.evaluate.sweep import Swept, add_workers, sweep
+from dt_viz.evaluate.options import Made, add_workers, computed
 from dt_viz.flows.fields import Array
-from dt_viz.metrics import (
-    dynamic_time_warping,
-    maximum_collision_distance,
-    resample_by_arc_length,
-    rms_jerk,
-    sharpest_turn,
-)
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.pictures import figures
@@ -73,31 +34,22 @@ from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.comparison import curves
 
-OUT = FOLDER
 PAPER_TASKS = ("push_box", "lift_box", "draw_s")
-
-
-@dataclass(frozen=True)
-class Table1Settings:
-    """Where spheres and starts are drawn; lengths in metres."""
-
-    along: tuple[float, float] = (0.2, 0.8)
-    """Part of the mean demonstration that spheres are drawn along."""
-    within: float = 0.05
-    """Largest distance of a sphere from it."""
-    perturbed_by: float = 0.05
-    """Largest distance of a perturbed start from a demonstrated one."""
-    max_drawn: int = 2000
-    """Largest number of spheres drawn for a task."""
-    reached: float = 0.01
-    """Distance from the goal at which a motion counts as having reached it."""
-
-
-SETTINGS = Table1Settings()
-SMALLEST = ("clearance", "reached")
-"""Columns whose worst value is the smallest."""
-UNITS = {"turn": (1.0, "°"), "reached": (100.0, "%"), "seconds": (1.0, "s"), "jerk": (1.0, "m/s³")}
-"""Factor and unit of each column in the printed table; all others are lengths, printed in millimetres."""
+ALONG = (0.2, 0.8)  # part of the mean demonstration that spheres are drawn along
+WITHIN = 0.05  # m, largest distance of a sphere from it
+PERTURBED_BY = 0.05  # m, largest distance of a perturbed start from a demonstrated one
+MAX_DRAWN = 2000  # number of spheres drawn for a task, at most
+REACHED = 0.01  # m from the goal within which a motion has reached it
+COLUMNS: Mapping[str, tuple[float, str]] = {
+    **{name: (1e3, name) for name in ("frechet", "dtw", "arm_depth", "hand_depth", "clearance", "goal_error")},
+    "turn": (1.0, "turn °"),
+    "jerk": (1.0, "jerk m/s³"),
+    "reached": (100.0, "reached %"),
+    "seconds": (1.0, "seconds s"),
+}
+"""Columns of the file, and their factors and headers in the printed table; the last two are of all motions of a place,
+the others of single ones."""
+SMALLEST = ("clearance", "reached")  # columns whose worst value is the smallest
 PAPER: Mapping[str, Sequence[tuple[float | None, float | None]]] = {
     "ours": ((0.124, 0.0), (0.127, 0.0), (0.067, 0.002)),
     "ours-no-avoidance": ((0.070, 0.012), (0.112, 0.012), (0.011, 0.018)),
@@ -111,102 +63,63 @@ PAPER: Mapping[str, Sequence[tuple[float | None, float | None]]] = {
 drawing of the planners."""
 
 
-OF_MOTIONS = ("frechet", "dtw", "arm_depth", "hand_depth", "clearance", "goal_error", "turn", "jerk")
-COLUMNS = (*OF_MOTIONS, "reached", "seconds")
-"""Columns of the file, see there: the first are of single motions, the others of all those of a place."""
-
-
-@dataclass(frozen=True)
-class RandomPlace:
+class RandomPlace(NamedTuple):
     """A sphere, and starts beside the demonstrated ones."""
 
     sphere: Sphere
-    perturbed: Array
-    """(P, 3), metres."""
-
-    @property
-    def obstacle(self) -> Union:
-        """The sphere as an obstacle."""
-        return Union((self.sphere,))
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Define the command's arguments."""
-    parser.add_argument("--methods", nargs="+", choices=tuple(METHODS), default=list(METHODS), help="(default: all)")
-    parser.add_argument("--tasks", nargs="+", choices=PAPER_TASKS, default=list(PAPER_TASKS), help="(default: all)")
-    parser.add_argument("--count", type=whole_number(1), default=10, help="places (default: %(default)s)")
-    parser.add_argument("--perturbed", type=whole_number(0), default=200, help="starts (default: %(default)s)")
-    parser.add_argument("--seed", type=whole_number(0), default=0, help="of the places (default: %(default)s)")
-    add_workers(parser)
-
-
-def run(options: argparse.Namespace) -> int:
-    """Run the command; 1 if a method needs what is not installed, or was not trained."""
-    methods = [METHODS[name] for name in options.methods]
-    for method in methods:
-        if method.missing:
-            print(f"{method.title} needs {', '.join(method.missing)}: {INSTALL}; or leave it out", file=sys.stderr)
-    if any(method.missing for method in methods):
-        return 1
-    try:
-        with sweep(options, Fitted) as (fitted, swept):
-            _measure(fitted, swept, methods, options)
-    except NotFittedError as error:
-        print(error, file=sys.stderr)
-        return 1
-    return 0
-
-
-def _measure(fitted: Fitted, swept: Swept, methods: Sequence[Method], options: argparse.Namespace) -> None:
-    """Measure all methods at all places; write and print the results.
-
-    Raises:
-        FormatError: the places are not found.
-        NotFittedError: a method was not trained.
-    """
-    folder, draws = options.out, figures.can_draw()
-    table: dict[str, dict[str, Any]] = {method.name: {} for method in methods}
-    problems = {name: fitted.problem(name) for name in options.tasks}
-    drawn_for = {name: drawn(problems[name], options.count, options.perturbed, options.seed) for name in problems}
-    cases = [(method.name, name, place) for name in problems for method in methods for place in drawn_for[name]]
-    found = swept(_measured, cases)
-    for name, problem in problems.items():
-        places, first_motions = drawn_for[name], {}
-        for method in methods:
-            arrays = gathered(problem, places, [*islice(found, len(places))])
-            write_npz(folder / f"{method.name}_{name}.npz", **arrays)
-            table[method.name][name] = cells(method.name, name, arrays)
-            x = arrays["x_0_0"]
-            path = x if len(x) > 1 else np.repeat(x, 2, axis=0)
-            first_motions[method.title] = curves(path, problem.task.paths[0], places[0].obstacle)
-            print(f"{method.title}, {problem.task.title}: {arrays['seconds'].sum():.0f} s of planning", flush=True)
-            write_json(folder / "table1.json", table)
-        print("\nmean (worst) [paper]; lengths in mm")
-        report([_row(method.title, problem.task.title, table[method.name][name]) for method in methods])
-        if draws:
-            files = (folder / f"figure6_{name}.{suffix}" for suffix in ("svg", "png"))
-            figures.save(figures.curves(problem.task.title, first_motions), *files)
+    perturbed: Array  # (P, 3), metres
 
 
 class Fitted:
     """The problems, and the methods that are fitted to them, each made when it is first asked for."""
 
     def __init__(self) -> None:
-        self._engine = new_engine(TASKS)
-        self.problem: Callable[[str], Problem] = cache(self._problem)
-        """Problem of a task."""
-        self.planner: Callable[[str, str], Planner] = cache(self._planner)
-        """Method by name, fitted to a task; raises NotFittedError, which names both, if it was not trained."""
+        engine = shared.new_engine(TASKS)
+        self.problem = cache(lambda task: problem_of(engine.nominal(Scenario(task)).learned, engine.follower))
+        self.planner = cache(lambda method, task: METHODS[method].fit(self.problem(task)))
 
-    def _problem(self, task: str) -> Problem:
-        return problem_of(self._engine.nominal(Scenario(task)).learned, self._engine.follower)
 
-    def _planner(self, method: str, task: str) -> Planner:
-        problem = self.problem(task)
-        try:
-            return METHODS[method].fit(problem)
-        except NotFittedError as error:
-            raise NotFittedError(f"{METHODS[method].title}, {problem.task.title}: {error}") from error
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Define the command's arguments."""
+    number, default = shared.whole_number, "(default: %(default)s)"
+    parser.add_argument("--methods", nargs="+", choices=tuple(METHODS), default=list(METHODS), help="(default: all)")
+    parser.add_argument("--tasks", nargs="+", choices=PAPER_TASKS, default=list(PAPER_TASKS), help="(default: all)")
+    parser.add_argument("--count", type=number(1), default=10, help=f"places {default}")
+    parser.add_argument("--perturbed", type=number(0), default=200, help=f"starts {default}")
+    parser.add_argument("--seed", type=number(0), default=0, help=f"of the places {default}")
+    parser.add_argument("--out", type=shared.output(), required=True, metavar="DIR", help="folder of what is written")
+    add_workers(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the command."""
+    methods, folder, draws, fitted = options.methods, options.out, figures.can_draw(), Made(Fitted)
+    for method in map(METHODS.__getitem__, methods):
+        if method.missing:
+            found = f"{method.title}, which needs {', '.join(method.missing)}"
+            raise FormatError("--methods", found, f"{INSTALL}, or the others")
+    problems = {name: fitted().problem(name) for name in options.tasks}
+    places = {name: drawn(problems[name], options.count, options.perturbed, options.seed) for name in problems}
+    cases = [(method, name, place) for name in problems for method in methods for place in places[name]]
+    found = computed(options, partial(_measured, fitted), cases)
+    table: dict[str, dict[str, Any]] = {method: {} for method in methods}
+    for name, problem in problems.items():
+        title, first_motions, rows = problem.task.title, {}, []
+        for method in methods:
+            arrays = gathered(problem, [*islice(found, options.count)])
+            shared.write_npz(folder / f"{method}_{name}.npz", arrays)
+            table[method][name] = cells(method, name, arrays)
+            rows.append(_row(METHODS[method].title, title, table[method][name]))
+            first_path, obstacle = _whole(arrays["x_0_0"]), Union((places[name][0].sphere,))
+            first_motions[METHODS[method].title] = curves(first_path, problem.task.paths[0], obstacle)
+            print(f"{METHODS[method].title}, {title}: {arrays['seconds'].sum():.0f} s of planning", flush=True)
+        print("\nmean (worst) [paper]; lengths in mm")
+        shared.report(rows)
+        if draws:
+            files = (folder / f"figure6_{name}.{suffix}" for suffix in ("svg", "png"))
+            figures.save(figures.curves(title, first_motions), *files)
+    shared.write_json(folder / "table1.json", table)
+    return 0
 
 
 def drawn(problem: Problem, count: int, num_perturbed: int, seed: int) -> list[RandomPlace]:
@@ -219,10 +132,10 @@ def drawn(problem: Problem, count: int, num_perturbed: int, seed: int) -> list[R
     rng, mean, undisturbed = np.random.default_rng(seed), task.mean_path, problem.learned.demonstrated.paths
     at_ends = np.concatenate([path[[0, -1]] for path in problem.postures])
     places: list[RandomPlace] = []
-    for _ in range(SETTINGS.max_drawn):
+    for _ in range(MAX_DRAWN):
         if len(places) == count:
             return places
-        centre = mean[round(rng.uniform(*SETTINGS.along) * (len(mean) - 1))] + in_ball(rng, SETTINGS.within, 1)[0]
+        centre = mean[round(rng.uniform(*ALONG) * (len(mean) - 1))] + in_ball(rng, WITHIN, 1)[0]
         sphere = Sphere(as_point(centre), 0.15)
         if any(sphere.signed_distance(path).min() >= 0 for path in undisturbed):
             continue
@@ -231,7 +144,7 @@ def drawn(problem: Problem, count: int, num_perturbed: int, seed: int) -> list[R
         share = (len(places) + 1) * num_perturbed // count - len(places) * num_perturbed // count
         beside = np.random.default_rng([seed, len(places)])  # places do not depend on how many starts there are
         places.append(RandomPlace(sphere, _perturbed(problem, sphere, share, beside)))
-    found = f"{len(places)} of {task.title!r} among {SETTINGS.max_drawn} spheres"
+    found = f"{len(places)} of {task.title!r} among {MAX_DRAWN} spheres"
     raise FormatError("--count", found, "places at which each motion collides and the ends are free, fewer of them")
 
 
@@ -239,131 +152,118 @@ def _perturbed(problem: Problem, sphere: Sphere, num: int, rng: np.random.Genera
     """Starts (num, 3), beside the demonstrated ones: reached by the arm, which is free there."""
     starts, robot = problem.task.starts, problem.robot
     found: list[Array] = []
-    for _ in range(SETTINGS.max_drawn):
+    for _ in range(MAX_DRAWN):
         if len(found) == num:
             break
         nearest = int(rng.integers(len(starts)))
-        start = starts[nearest] + in_ball(rng, SETTINGS.perturbed_by, 1)[0]
+        start = starts[nearest] + in_ball(rng, PERTURBED_BY, 1)[0]
         posture = track(robot, start[None], problem.postures[nearest][0])
         if posture.error[0] < 1e-3 and robot.collision.obstacle_distance(posture.q, sphere)[0].min() > 0:
             found.append(start)
     return np.array(found).reshape(-1, 3)
 
 
-@dataclass(frozen=True)
-class PlaceFigures:
-    """Motions of a method at a place, and what is measured of them."""
-
-    motions: Sequence[tuple[Array, Array, Array]]
-    """Path (N, 3), times (N,) and postures (M, n) from each start."""
-    of_motions: Sequence[Sequence[float]]
-    """`OF_MOTIONS` of each."""
-    ends: Array
-    """(P, 3) where motions from the perturbed starts end, metres."""
-    seconds: float
-
-
-def _measured(fitted: Fitted, case: tuple[str, str, RandomPlace]) -> PlaceFigures:
+def _measured(fitted: Made[Fitted], case: tuple[str, str, RandomPlace]) -> dict[str, Any]:
     """Measure a method, by name, at a place of a task."""
     method, task, place = case
-    return measured(fitted.planner(method, task), fitted.problem(task), place)
+    problem = fitted().problem(task)
+    try:
+        return measured(fitted().planner(method, task), problem, place)
+    except NotFittedError as error:
+        found = f"{METHODS[method].title}, {problem.task.title}: {error}"
+        raise FormatError("--methods", found, "methods that are fitted to the tasks") from error
 
 
-def measured(planner: Planner, problem: Problem, place: RandomPlace) -> PlaceFigures:
-    """Plan and measure the motions of a method at a place."""
+def measured(planner: Planner, problem: Problem, place: RandomPlace) -> dict[str, Any]:
+    """Plan and measure the motions of a method at a place.
+
+    Returns:
+        The arrays of the file by their names, with {} for the number of the place, and its values of `COLUMNS`.
+    """
+    obstacle, ends = Union((place.sphere,)), place.perturbed
     began = time.thread_time()
-    plan = planner(place.obstacle, problem.task.starts)
+    plan = planner(obstacle, problem.task.starts)
     seconds = time.thread_time() - began
     motions = [*zip(plan.paths, plan.times, joints_along(problem, plan), strict=True)]
     compared = zip(motions, problem.task.paths, strict=True)
-    rows = [measure(problem, *motion, demonstration, place.obstacle) for motion, demonstration in compared]
-    return PlaceFigures(motions, rows, _ends(planner, place), seconds)
-
-
-def gathered(problem: Problem, places: Sequence[RandomPlace], found: Sequence[PlaceFigures]) -> dict[str, Array]:
-    """The arrays of a method's file."""
-    task, goal = problem.task, problem.learned.goal
-    arrays: dict[str, Array] = {f"demo_{i}": path for i, path in enumerate(task.paths)}
-    arrays |= {f"demo_t_{i}": d.times for i, d in enumerate(task.demonstrations)} | {"goal": goal}
-    reached = []
-    for k, (place, at_place) in enumerate(zip(places, found, strict=True)):
-        for i, motion in enumerate(at_place.motions):
-            arrays |= {f"{name}_{k}_{i}": values for name, values in zip("xtq", motion, strict=True)}
-        arrays |= {f"obstacle_{k}": np.array([*place.sphere.position, place.sphere.diameter])}
-        arrays |= {f"perturbed_{k}": place.perturbed, f"ends_{k}": at_place.ends}
-        near = np.linalg.norm(at_place.ends - goal, axis=1) <= SETTINGS.reached
-        reached.append(near.mean() if len(near) else np.nan)
-    of_motions = np.array([at_place.of_motions for at_place in found]).transpose(2, 0, 1)
-    seconds = np.array([at_place.seconds for at_place in found])
-    return arrays | dict(zip(COLUMNS, (*of_motions, np.array(reached), seconds), strict=True))
+    rows = [measure(problem, *motion, demonstration, obstacle) for motion, demonstration in compared]
+    if len(ends):
+        try:
+            ends = np.stack([path[-1] for path in planner(obstacle, ends).paths])
+        except UnreachableError:
+            ends = np.full_like(ends, np.inf)
+    near = np.linalg.norm(ends - problem.learned.goal, axis=1) <= REACHED
+    columns = [*np.transpose(rows), near.mean() if len(near) else np.nan, seconds]
+    return {
+        **{f"{name}_{{}}_{i}": values[k] for i, values in enumerate(motions) for k, name in enumerate("xtq")},
+        "obstacle_{}": np.array([*place.sphere.position, place.sphere.diameter]),
+        "perturbed_{}": place.perturbed,
+        "ends_{}": ends,
+        **dict(zip(COLUMNS, columns, strict=True)),
+    }
 
 
 def measure(problem: Problem, x: Array, t: Array, q: Array, demonstration: Array, obstacle: Union) -> list[float]:
-    """Measure one motion: the columns `OF_MOTIONS`.
+    """Measure one motion, the columns of single motions: the path x (N, 3), metres, at times t (N,), seconds.
 
-    Args:
-        problem: the task and the arm.
-        x: (N, 3) path of the end effector, metres.
-        t: (N,) its times, seconds.
-        q: (M, n) postures of the arm along it, rad.
-        demonstration: (T, 3), metres.
-        obstacle: what was to be avoided.
+    The arm's postures along it are q (M, n), rad; the demonstration is (T, 3), metres.
     """
-    clearance = problem.robot.collision.nearest_to_obstacle(q, obstacle).distance
-    path = x if len(x) > 1 else np.repeat(x, 2, axis=0)
-    warped, matched = [resample_by_arc_length(p, 200) for p in (path, demonstration)]
+    clearance, path = problem.robot.collision.nearest_to_obstacle(q, obstacle).distance, _whole(x)
+    warped, matched = [metrics.resample_by_arc_length(p, 200) for p in (path, demonstration)]
     return [
         float(frechet([path], [demonstration])[0]),
-        dynamic_time_warping(warped, matched) / len(matched),
+        metrics.dynamic_time_warping(warped, matched) / len(matched),
         max(0.0, -clearance),
-        maximum_collision_distance(path, obstacle.signed_distance) + 0.0,  # never -0
+        metrics.maximum_collision_distance(path, obstacle.signed_distance) + 0.0,  # never -0
         clearance,
         float(np.linalg.norm(x[-1] - problem.learned.goal)),
-        sharpest_turn(x, TURN_ARC),
-        rms_jerk(t, x, 0.05),  # the paper's 20 Hz
+        metrics.sharpest_turn(x, TURN_ARC),
+        metrics.rms_jerk(t, x, 0.05),  # the paper's 20 Hz
     ]
+
+
+def _whole(x: Array) -> Array:
+    """A path of at least two points; that of a start without a way has one."""
+    return x if len(x) > 1 else np.repeat(x, 2, axis=0)
 
 
 def joints_along(problem: Problem, plan: Plan) -> tuple[Array, ...]:
     """The arm's postures (N_i, n), rad, along a plan: its own, or those that track its paths, as the demonstrations."""
     if plan.joints is not None:
         return plan.joints
-    return tuple(
-        track(problem.robot, path, along[0]).q for path, along in zip(plan.paths, problem.postures, strict=True)
-    )
+    starts = (postures[0] for postures in problem.postures)
+    return tuple(track(problem.robot, path, start).q for path, start in zip(plan.paths, starts, strict=True))
 
 
-def _ends(planner: Planner, place: RandomPlace) -> Array:
-    """Where motions from the perturbed starts of a place end, (P, 3), metres."""
-    if not len(place.perturbed):
-        return place.perturbed
-    try:
-        return np.stack([path[-1] for path in planner(place.obstacle, place.perturbed).paths])
-    except UnreachableError:
-        return np.full_like(place.perturbed, np.inf)
+def gathered(problem: Problem, found: Sequence[Mapping[str, Any]]) -> dict[str, Array]:
+    """Gather the arrays of a method's file, of what was measured at each place."""
+    arrays: dict[str, Array] = {f"demo_{i}": path for i, path in enumerate(problem.task.paths)}
+    arrays |= {f"demo_t_{i}": d.times for i, d in enumerate(problem.task.demonstrations)}
+    for k, at_place in enumerate(found):
+        arrays |= {name.format(k): values for name, values in at_place.items() if name not in COLUMNS}
+    columns = {name: np.array([at_place[name] for at_place in found]) for name in COLUMNS}
+    return arrays | columns | {"goal": problem.learned.goal}
 
 
 def cells(method: str, task: str, arrays: Mapping[str, Array]) -> dict[str, dict[str, float | None]]:
-    """The cells of a method's file, by column; None is unknown."""
-    frechet, depth = PAPER[method][PAPER_TASKS.index(task)] if method in PAPER else (None, None)
-    paper, found = {"frechet": frechet, "arm_depth": depth}, {}
+    """Return the cells of a method's file, by column; None is unknown."""
+    paper: dict[str, float | None] = {}
+    if method in PAPER:
+        paper = dict(zip(("frechet", "arm_depth"), PAPER[method][PAPER_TASKS.index(task)], strict=True))
+    found = {}
     for column in COLUMNS:
-        known = arrays[column] if np.isfinite(arrays[column]).all() else None
-        worst = np.min if column in SMALLEST else np.max
-        of_ours = {"mean": np.mean, "worst": worst}
-        found[column] = {name: None if known is None else float(of(known)) for name, of in of_ours.items()}
+        of_ours = {"mean": np.mean, "worst": np.min if column in SMALLEST else np.max}
+        known = np.isfinite(arrays[column]).all()
+        found[column] = {name: float(of(arrays[column])) if known else None for name, of in of_ours.items()}
         found[column]["paper"] = paper.get(column)
     return found
 
 
-def _row(title: str, task: str, cells: Mapping[str, Mapping[str, float | None]]) -> Row:
+def _row(title: str, task: str, cells: Mapping[str, Mapping[str, float | None]]) -> shared.Row:
     """Row of a method and a task, by their titles, in the printed table."""
-    names = {column: f"{column} {UNITS[column][1]}" if column in UNITS else column for column in COLUMNS}
-    return {"method": title, "task": task, **{names[column]: _cell(column, cells[column]) for column in COLUMNS}}
-
-
-def _cell(column: str, cell: Mapping[str, float | None]) -> str:
-    factor, _ = UNITS.get(column, (1e3, ""))
-    digits = 3 if column == "seconds" else 0
-    mean, worst, paper = ("–" if (v := cell[k]) is None else f"{factor * v:.{digits}f}" for k in cell)
-    return f"{mean} ({worst})" + (f" [{paper}]" if cell["paper"] is not None else "")
+    row = {"method": title, "task": task}
+    for column, (factor, header) in COLUMNS.items():
+        digits = 3 if column == "seconds" else 0
+        mean, worst, paper = ("–" if v is None else f"{factor * v:.{digits}f}" for v in cells[column].values())
+        row[header] = f"{mean} ({worst})" + (f" [{paper}]" if cells[column]["paper"] is not None else "")
+    return row

@@ -9,14 +9,11 @@ import numpy as np
 
 import dt_viz as dt
 
-PERIOD = 0.01
-"""Time between two commands, seconds: 100 Hz."""
-SEEN = 4
-"""Number of commands between two looks at the ball."""
+PERIOD = 0.01  # time between two commands, seconds: 100 Hz
+SEEN = 4  # number of commands between two looks at the ball
 BALL, VELOCITY = np.array([0.35, -0.53, 0.20]), np.array([-0.1, 0.0, 0.0])
 """Where the ball is at first, metres, and its velocity, m/s."""
-MARGIN = 0.03
-"""Clearance that is asked for, metres."""
+MARGIN = 0.03  # clearance that is asked for, metres
 
 
 def run(motion: dt.Motion, arm: dt.Arm, seconds: float = 12.0) -> tuple[np.ndarray, np.ndarray]:

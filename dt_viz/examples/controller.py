@@ -12,12 +12,10 @@ import numpy as np
 
 import dt_viz as dt
 
-PERIOD = 0.01
-"""Time between two commands, seconds: 100 Hz."""
+PERIOD = 0.01  # time between two commands, seconds: 100 Hz
 PUSH_AT, PUSH = 100, np.array([0.03, 0.0, 0.04])
 """Number of the command at which somebody pushes the hand, and by how much, metres."""
-ARRIVED = 2e-3
-"""Distance from the goal at which the controller stops, metres."""
+ARRIVED = 2e-3  # distance from the goal at which the controller stops, metres
 
 
 def run(motion: dt.Motion, start: np.ndarray, longest: float = 60.0) -> np.ndarray:

@@ -12,8 +12,7 @@ import viser
 
 import dt_viz as dt
 
-DIAMETER = 0.15
-"""Diameter of the ball, metres."""
+DIAMETER = 0.15  # diameter of the ball, metres
 
 
 class Scene:

@@ -22,6 +22,8 @@ LASA_UNITS = {"length": 1e-3, "time": 1.0}
 """Units of the LASA handwriting data: millimetres and seconds."""
 ALONE = "recordings; this file is opened alone"
 """What is accepted in place of a saved motion or a saved scenario."""
+WITHIN = "hard links, and data within the file"
+"""What is accepted of an HDF5 file, whose links and datasets may name any other file."""
 
 
 def read_npz(path: Path, options: ReadOptions) -> Iterator[Table]:
@@ -120,7 +122,11 @@ def read_hdf5(path: Path, options: ReadOptions) -> Iterator[Table]:
         for key in sorted(
             group, key=lambda key: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", key)]
         ):
+            if not isinstance(link := group.get(key, getlink=True), h5py.HardLink):
+                raise FormatError(f"link {key[:40]!r}", f"a link of the kind {type(link).__name__}", WITHIN)
             item = group[key]
+            if isinstance(item, h5py.Dataset) and (item.is_virtual or item.external):
+                raise FormatError(f"dataset {key[:40]!r}", "data in other files", WITHIN)
             if isinstance(item, h5py.Group):
                 tree[key] = tree_of(item)
             elif item.dtype.kind in "iuf" and (item.ndim < 3 or (item.ndim == 3 and item.dtype.kind == "f")):

@@ -17,6 +17,8 @@ from dt_viz.files.tables import LIMITS, ReadOptions, Table, imported
 
 POSES = ("PoseStamped", "Pose", "PoseWithCovarianceStamped", "Odometry", "TransformStamped", "PointStamped", "Point")
 TRANSFORMS, JOINTS = ("TFMessage", "tfMessage"), "JointState"
+MARKS = {*"%?#"}
+"""Characters that SQLite, to which rosbags gives paths as addresses, does not take as they are: "%2F" is "/"."""
 RANKS = {**dict.fromkeys(POSES, 0), **dict.fromkeys(TRANSFORMS, 1), JOINTS: 2}
 """Types of messages that are read; of those in a bag, the ones of the lowest rank."""
 
@@ -33,7 +35,7 @@ def read_bag(path: Path, options: ReadOptions) -> Iterator[Table]:
     reader = imported("rosbags.highlevel", "ros").AnyReader
     typesys = imported("rosbags.typesys", "ros")
     latest = typesys.get_typestore(typesys.Stores.LATEST)
-    with _lower_suffix(path) as lower, reader([lower], default_typestore=latest) as bag:
+    with _plain(path) as plain, reader([plain], default_typestore=latest) as bag:
         chosen, frame = _chosen(bag, options.topic)
         messages = (
             (time, bag.deserialize(content, connection.msgtype)) for connection, time, content in bag.messages(chosen)
@@ -54,9 +56,11 @@ def read_bag(path: Path, options: ReadOptions) -> Iterator[Table]:
 
 
 @contextmanager
-def _lower_suffix(path: Path) -> Iterator[Path]:
-    """Give a path of the bag with a suffix in lower case, as rosbags knows them."""
-    if path.suffix == path.suffix.lower() or path.is_dir():
+def _plain(path: Path) -> Iterator[Path]:
+    """Give a path of the bag without `MARKS`, and with a suffix in lower case, as rosbags knows them."""
+    if path.is_dir() and (names := [file.name for file in path.iterdir() if MARKS & {*file.name}]):
+        raise FormatError("name", repr(min(names)[:40]), "names of a bag's files without %, ? and #")
+    if not MARKS & {*str(path)} and (path.is_dir() or path.suffix.islower()):
         yield path
         return
     with TemporaryDirectory() as folder:

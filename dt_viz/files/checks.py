@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike
 from dt_viz.errors import FormatError
 from dt_viz.numerics import Array, Indices
 
-MAX_FACES = 500_000
-"""Largest number of triangles of a mesh."""
+MAX_FACES = 500_000  # largest number of triangles of a mesh
 
 
 def read_bytes(path: Path, max_bytes: int) -> bytes:

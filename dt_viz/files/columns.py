@@ -48,8 +48,7 @@ TOOL = {"cartesian", "tcp", "ee", "eef", "effector", "tool"}
 """Words of which the first three numbered columns are places: ``actual_TCP_pose_0``."""
 WANTED = {"action", "actions", "cmd", "command", "target", "desired", "goal", "ref", "reference", "setpoint", "object"}
 """Words of places that the hand has not been at."""
-WANTED_RANK = 4
-"""Rank of such places: they come after joint angles."""
+WANTED_RANK = 4  # rank of such places: they come after joint angles
 OTHERS = {
     *("vel", "velocity", "velocities", "linear", "angular", "twist", "acc", "accel", "acceleration", "jerk"),
     *("force", "torque", "effort", "wrench", "imu", "gyro", "mag", "rpy", "euler", "omega"),
@@ -63,24 +62,18 @@ AROUND_JOINTS = (HAND - {"gripper"}) | ANGLES | JOINTS
 """Words that may stand beside the name of an arm's joint: ``observation.state.shoulder_pan.pos``."""
 MAX_COLUMNS = 1000
 """Number of columns without names of their own that a matrix may have; an empty one may claim billions."""
-MAX_TURN = 4 * np.pi
-"""Largest joint angle, rad; numbers beyond it are degrees."""
+MAX_TURN = 4 * np.pi  # largest joint angle, rad; numbers beyond it are degrees
 
 
 @dataclass(frozen=True)
 class Role:
     """What a column is."""
 
-    kind: str
-    """"time", "label", "rate", "position", "orientation" or "joint"."""
-    group: tuple[str, ...] = ()
-    """Words that it shares with the columns that it belongs to."""
-    part: str = ""
-    """Its axis x, y, z or w."""
-    rank: int = 0
-    """Place among the columns of its kind: the lowest is used."""
-    unit: str = ""
-    """Its unit, a name of `UNITS`; empty if it does not say."""
+    kind: str  # "time", "label", "rate", "position", "orientation" or "joint"
+    group: tuple[str, ...] = ()  # words that it shares with the columns that it belongs to
+    part: str = ""  # its axis x, y, z or w
+    rank: int = 0  # place among the columns of its kind: the lowest is used
+    unit: str = ""  # its unit, a name of `UNITS`; empty if it does not say
 
 
 def unit_of(word: str) -> str:
@@ -258,19 +251,15 @@ class Layout:
     """Names of the columns that are used."""
 
     time: str = ""
-    fraction: str = ""
-    """Column of nanoseconds that belong to the seconds of `time`."""
+    fraction: str = ""  # column of nanoseconds that belong to the seconds of `time`
     label: str = ""
     rate: str = ""
-    positions: tuple[str, ...] = ()
-    """x, y and perhaps z."""
-    orientations: tuple[str, ...] = ()
-    """w, x, y, z, or none."""
+    positions: tuple[str, ...] = ()  # x, y and perhaps z
+    orientations: tuple[str, ...] = ()  # w, x, y, z, or none
     joints: tuple[str, ...] = ()
     joint_names: tuple[str, ...] = ()
     """Names of the joints: the arm's where they are known, otherwise of the columns."""
-    units: tuple[str, ...] = ()
-    """Units that names of times, positions and joints end in."""
+    units: tuple[str, ...] = ()  # units that names of times, positions and joints end in
 
     @property
     def used(self) -> set[str]:

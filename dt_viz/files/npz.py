@@ -21,8 +21,7 @@ from dt_viz.numerics import Array, Indices
 
 logger = logging.getLogger(__name__)
 T = TypeVar("T")
-MAX_ARRAYS = 10_000
-"""Largest number of arrays of an archive from a visitor."""
+MAX_ARRAYS = 10_000  # largest number of arrays of an archive from a visitor
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +30,7 @@ class Archive:
 
     numbers: Mapping[str, Array]
     integers: Mapping[str, Indices]
-    texts: Mapping[str, str]
-    """Texts; arrays of several are left out."""
+    texts: Mapping[str, str]  # texts; arrays of several are left out
 
 
 def arrays_of(
@@ -70,7 +68,7 @@ def arrays_of(
 
 
 def read_archive(files: Sequence[tuple[str, bytes]], max_bytes: int, max_text: int) -> Archive:
-    """Read the arrays of one archive, its name and its content, in the process of `dt_viz.files.worker`.
+    """Read the arrays of one archive, its name and its content, in the process of `dt_viz.files.reading`.
 
     Raises:
         FormatError: it unpacks to more than `max_bytes`, a text has more than `max_text` characters, or there are other

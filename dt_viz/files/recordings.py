@@ -1,4 +1,4 @@
-"""Visitors' recordings: several files at once, or archives of folders, read by the process of `dt_viz.files.worker`.
+"""Visitors' recordings: several files at once, or archives of folders, read by the process of `dt_viz.files.reading`.
 
 What a file leaves open is guessed and asked: which of its columns are places, which topic of a bag is the hand's. What
 is answered is used for files that ask, and for no others. A file that cannot be read is named, and the others are read.
@@ -22,10 +22,8 @@ from dt_viz.files.folders import accepted_as, parts_of, read_part
 from dt_viz.files.tables import ReadOptions
 from dt_viz.files.takes import READERS, Take
 
-ARCHIVE = ".zip"
-"""Suffix of an archive of a folder."""
-AXES = ("t", "x", "y", "z")
-"""Roles of columns that are asked for; z and t may be missing."""
+ARCHIVE = ".zip"  # suffix of an archive of a folder
+AXES = ("t", "x", "y", "z")  # roles of columns that are asked for; z and t may be missing
 NO_COLUMN = "–"
 
 Answers = Mapping[str, Any]
@@ -36,11 +34,9 @@ Answers = Mapping[str, Any]
 class RecordingLimits:
     """The largest recordings of one visitor."""
 
-    unpacked: int = 200 * 10**6
-    """Bytes that archives unpack to."""
+    unpacked: int = 200 * 10**6  # bytes that archives unpack to
     files: int = 1000
-    numbers: int = 4_000_000
-    """Numbers in all takes: 32 MB, which are kept for the visitor."""
+    numbers: int = 4_000_000  # numbers in all takes: 32 MB, which are kept for the visitor
 
 
 LIMITS = RecordingLimits()
@@ -50,11 +46,9 @@ LIMITS = RecordingLimits()
 class Question:
     """What a file leaves open."""
 
-    about: str
-    """See `UnclearError.question`."""
+    about: str  # see `UnclearError.question`
     choices: tuple[str, ...]
-    answer: Any
-    """What is used now: a guess, or what was answered."""
+    answer: Any  # what is used now: a guess, or what was answered
 
 
 @dataclass(frozen=True)
@@ -62,16 +56,13 @@ class Recordings:
     """What is read of a visitor's files."""
 
     takes: tuple[Take, ...] = ()
-    notes: tuple[str, ...] = ()
-    """What was chosen and what is not used."""
-    refused: tuple[str, ...] = ()
-    """A line for each file that cannot be read."""
-    questions: Mapping[str, Question] = field(default_factory=dict)
-    """By what they are about."""
+    notes: tuple[str, ...] = ()  # what was chosen and what is not used
+    refused: tuple[str, ...] = ()  # a line for each file that cannot be read
+    questions: Mapping[str, Question] = field(default_factory=dict)  # by what they are about
 
 
 def read_recordings(files: Sequence[tuple[str, bytes]], answers: Answers, joint_names: Sequence[str]) -> Recordings:
-    """Read what a visitor sent, each a name and its content, in the process of `dt_viz.files.worker`.
+    """Read what a visitor sent, each a name and its content, in the process of `dt_viz.files.reading`.
 
     They are recordings, or archives of folders of them; answers are to the questions of earlier readings.
 

@@ -1,4 +1,4 @@
-"""Readers of meshes and point clouds by trimesh and numpy, for the process of `dt_viz.files.worker`.
+"""Readers of meshes and point clouds by trimesh and numpy, for the process of `dt_viz.files.reading`.
 
 They are meant for a process with limits: on hostile bytes they raise anything, run long, need memory or crash.
 """
@@ -31,22 +31,17 @@ class ShapeLimits:
     vertices: int = 3 * MAX_FACES
     points: int = 1_000_000
     lines: int = 2_000_000
-    unpacked: int = 40 * 10**6
-    """Bytes that an archive of points unpacks to."""
-    model: int = 200 * 10**6
-    """Bytes that a 3MF file, which is text in an archive, unpacks to."""
+    unpacked: int = 40 * 10**6  # bytes that an archive of points unpacks to
+    model: int = 200 * 10**6  # bytes that a 3MF file, which is text in an archive, unpacks to
 
 
 LIMITS = ShapeLimits()
-LABELS = ("occupied", "occupancy", "label", "labels")
-"""Names of the labels in a file of points."""
-TEXTS = (".obj", ".off", ".csv", ".stl", ".ply", ".gltf")
-"""Suffixes of what is text, or may be."""
+LABELS = ("occupied", "occupancy", "label", "labels")  # names of the labels in a file of points
+TEXTS = (".obj", ".off", ".csv", ".stl", ".ply", ".gltf")  # suffixes of what is text, or may be
 EXTENSIONS = (b"KHR_draco_mesh_compression", b"EXT_meshopt_compression", b"EXT_mesh_gpu_instancing")
 """Extensions of glTF files that change triangles, and are not read."""
 
-Files = Sequence[tuple[str, bytes]]
-"""Names and contents."""
+Files = Sequence[tuple[str, bytes]]  # names and contents
 Columns = tuple[np.ndarray, np.ndarray | None, tuple[str, ...]]
 """Points, labels and notes of `Points`, of any type."""
 
@@ -55,24 +50,18 @@ Columns = tuple[np.ndarray, np.ndarray | None, tuple[str, ...]]
 class Triangles:
     """A mesh that was read and repaired."""
 
-    vertices: Array
-    """(V, 3)"""
-    faces: Indices
-    """(F, 3), indices of vertices."""
-    notes: tuple[str, ...]
-    """What was repaired, for the page."""
+    vertices: Array  # (V, 3)
+    faces: Indices  # (F, 3), indices of vertices
+    notes: tuple[str, ...]  # what was repaired, for the page
 
 
 @dataclass(frozen=True)
 class Points:
     """A point cloud that was read."""
 
-    points: Array
-    """(K, 3)"""
-    labels: Array | None
-    """(K,) 1 occupied and 0 free; None where there are none."""
-    notes: tuple[str, ...]
-    """What was left out, for the page."""
+    points: Array  # (K, 3)
+    labels: Array | None  # (K,) 1 occupied and 0 free; None where there are none
+    notes: tuple[str, ...]  # what was left out, for the page
 
 
 def read_triangles(files: Files) -> Triangles:
@@ -173,7 +162,6 @@ def _npz_points(content: bytes) -> Columns:
 
 
 def _csv_points(content: bytes) -> Columns:
-    """Read columns by their names, in any order."""
     first, _, rows = content.decode("utf-8-sig").partition("\n")
     header = [name.strip().lower() for name in next(csv.reader([first]), [])]
     wanted = ["x", "y", "z", *(name for name in LABELS if name in header)][:4]

@@ -21,36 +21,28 @@ from dt_viz.files.columns import role_of
 class TakeLimits:
     """The largest recordings: fifty takes of 200,000 samples with room for orientations."""
 
-    bytes: int = 512 * 2**20
-    """Bytes of a file, and of what it unpacks to."""
-    text: int = 64 * 2**20
-    """Bytes of JSON, which needs ten times as much while it is read."""
-    numbers: int = 60_000_000
-    """Numbers in the columns of a file."""
+    bytes: int = 512 * 2**20  # bytes of a file, and of what it unpacks to
+    text: int = 64 * 2**20  # bytes of JSON, which needs ten times as much while it is read
+    numbers: int = 60_000_000  # numbers in the columns of a file
     columns: int = 2000
 
 
 LIMITS = TakeLimits()
-EMPTY = ("", "na", "nan", "none", "null")
-"""Words in cells without a number."""
+EMPTY = ("", "na", "nan", "none", "null")  # words in cells without a number
 
 
 @dataclass(frozen=True)
 class ReadOptions:
     """What is known of recorded motions beside their file."""
 
-    rate: float | None = None
-    """Samples per second (Hz) of takes without times."""
+    rate: float | None = None  # samples per second (Hz) of takes without times
     unit: str | None = None
     """Units of lengths, times and angles, such as "mm" or "cm,ms,deg"; None recognises them."""
     columns: str | Sequence[str] | Mapping[str, str] | None = None
     """Names of a table's columns in their order, or the columns to use by what they are: ``{"x": "column"}``."""
-    topic: str | None = None
-    """Topic of a bag, or child frame of its transforms."""
-    joint_names: tuple[str, ...] = ()
-    """Names of the joints of the arm at hand; empty without one."""
-    asks: bool = False
-    """Whether what is not clear is asked, of all columns, rather than guessed."""
+    topic: str | None = None  # topic of a bag, or child frame of its transforms
+    joint_names: tuple[str, ...] = ()  # names of the joints of the arm at hand; empty without one
+    asks: bool = False  # whether what is not clear is asked, of all columns, rather than guessed
 
     @property
     def num_joints(self) -> int | None:
@@ -79,18 +71,14 @@ def at_sample(row: int) -> str:
 class Table:
     """Named columns as a file holds them, of one take or, told apart by labels or times, several."""
 
-    name: str
-    """Name of the take."""
+    name: str  # name of the take
     columns: Mapping[str, Any]
     """Arrays (T,) or (T, k) of numbers, or (T,) of text; a matrix without a name has the name ""."""
-    place: Callable[[int], str] = at_sample
-    """Describes the place of a row in the file."""
+    place: Callable[[int], str] = at_sample  # describes the place of a row in the file
     units: dict[str, float] = field(default_factory=dict)
     """Sizes of the units of lengths, times and angles, as far as the format says."""
-    unused: tuple[str, ...] = ()
-    """Names of columns that were not read."""
-    labels: tuple[str, ...] = ()
-    """Texts of labels, of which the column of labels holds the indices."""
+    unused: tuple[str, ...] = ()  # names of columns that were not read
+    labels: tuple[str, ...] = ()  # texts of labels, of which the column of labels holds the indices
     is_text: bool = False
     """Whether it is text, in which the first of three columns without names may be times."""
 

@@ -15,14 +15,12 @@ from dt_viz.files.checks import check_at_most, checked_suffix, real_numbers
 from dt_viz.files.columns import MAX_TURN, UNITS, Layout, expanded, is_kind, layout, numbered, role_of, unit_of, unnamed
 from dt_viz.files.tables import LIMITS, ReadOptions, Table, at_sample, read_text
 
-UNTIMED = 5.0
-"""Duration of a take without times or rate, seconds."""
+UNTIMED = 5.0  # duration of a take without times or rate, seconds
 MAX_REACH = 10.0
 """Coordinate beyond any arm's reach, metres: larger ones are centimetres, or millimetres from ten times as much."""
 MAX_DURATION, SLOW = 120.0, 0.5
 """Duration and step in seconds beyond which times are taken to be in a smaller unit."""
-USUAL_RATE = 100.0
-"""Rate in Hz that decides between the units of such times: the nearest is taken."""
+USUAL_RATE = 100.0  # rate in Hz that decides between the units of such times: the nearest is taken
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,19 +28,15 @@ class Take:
     """One recorded motion of the hand, or of an arm's joints, before it is checked; its units may be others."""
 
     name: str
-    times: np.ndarray
-    """(T,), seconds from any start."""
-    positions: np.ndarray | None
-    """(T, d), metres, d is 2 or 3; None for motions of joints."""
+    times: np.ndarray  # (T,), seconds from any start
+    positions: np.ndarray | None  # (T, d), metres, d is 2 or 3; None for motions of joints
     orientations: np.ndarray | None
     """(T, 4) unit quaternions wxyz, each in the hemisphere of the one before."""
-    joints: np.ndarray | None
-    """(T, n), rad."""
+    joints: np.ndarray | None  # (T, n), rad
     joint_names: tuple[str, ...]
     units: dict[str, float]
     """Sizes of the units of "length", "time" and "angle", as far as the file says."""
-    is_timed: bool = True
-    """Whether the file has its times or its rate."""
+    is_timed: bool = True  # whether the file has its times or its rate
     place: Callable[[int], str] = at_sample
     """Describes the place of a sample in the file, for messages."""
 

@@ -16,8 +16,7 @@ import numpy as np
 from dt_viz.errors import FormatError
 from dt_viz.files.checks import check_at_most, check_size
 
-MAX_DIMENSIONS, MAX_ARRAYS = 2, 5000
-"""Largest number of axes of an array, and of arrays."""
+MAX_DIMENSIONS, MAX_ARRAYS = 2, 5000  # largest number of axes of an array, and of arrays
 
 
 class _Array(msgspec.Struct, forbid_unknown_fields=True):

@@ -114,18 +114,13 @@ def complex_numbers(name: str) -> FormatError:
     return FormatError(f"array {name[:40]!r}", "complex numbers", "real numbers")
 
 
-def _lettered(arrays: Mapping[str, np.ndarray]) -> bool:
-    """Return whether arrays are takes a, b, …, which are no columns."""
-    return len(arrays) > 1 and set(arrays) <= set("abcdefg")
-
-
 def _of_mapping(tree: Mapping[str, Any], name: str, joints: tuple[str, ...]) -> Iterator[Table]:
     own = {key: value for key, value in tree.items() if isinstance(value, np.ndarray)}
     if numbered := _numbered(own, joints):
         for k, arrays in numbered.items():
             yield from _several(arrays, f"{name} {k}")
     elif (
-        not _lettered(own)
+        not (len(own) > 1 and set(own) <= set("abcdefg"))
         and any(value.ndim for value in own.values())
         and _tells(arrays := _all_upright(flat(tree)), joints)
     ):

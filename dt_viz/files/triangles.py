@@ -30,8 +30,7 @@ MAX_CROSSINGS = 3_000_000
 class GridSettings:
     """How a solid's signed distance is computed."""
 
-    num_nodes: int = 64**3
-    """Approximate number of nodes of the grid."""
+    num_nodes: int = 64**3  # approximate number of nodes of the grid
     margin: float = 0.2
     """Margin of the grid around the shape, relative to the largest side of its bounding box."""
     num_samples: int = 60_000
@@ -137,8 +136,7 @@ def _winding(triangles: Array, origin: Array, cell: float, shape: tuple[int, ...
 class Distances:
     """What a process computes of a mesh."""
 
-    values: Array
-    """(n_x, n_y, n_z) signed distances of the nodes of a grid, in the mesh's unit."""
+    values: Array  # (n_x, n_y, n_z) signed distances of the nodes of a grid, in the mesh's unit
 
 
 def read_distances(

@@ -13,8 +13,7 @@ import numpy as np
 
 from dt_viz.errors import FormatError
 
-CLASS = "class"
-"""Key of the name of an object's class."""
+CLASS = "class"  # key of the name of an object's class
 SCALARS = {bool: "true or false", int: "an integer", float: "a finite number", str: "text"}
 """Types of scalars, and their names in messages."""
 

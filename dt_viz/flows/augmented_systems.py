@@ -25,8 +25,7 @@ from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
 class PhaseCurve:
     """A smooth curve over the phase, continued straight beyond its ends."""
 
-    spline: CubicSpline
-    """From phases between the first and the last knot to values (*V,)."""
+    spline: CubicSpline  # from phases between the first and the last knot to values (*V,)
 
     @classmethod
     def through(cls, phases: Array, values: Array) -> PhaseCurve:
@@ -93,10 +92,8 @@ class Shear(Diffeomorphism):
     """(y, s, a) ↦ (y − c(s; a), s, a); its Jacobian has determinant 1 everywhere."""
 
     SCALED = ("amount",)
-    predictions: Predictions
-    """They give c."""
-    amount: float = 1.0
-    """Part of c that is taken away."""
+    predictions: Predictions  # they give c
+    amount: float = 1.0  # part of c that is taken away
 
     @property
     def dim(self) -> int:
@@ -126,8 +123,7 @@ class Translation(Diffeomorphism):
     """y ↦ y + shift."""
 
     SCALED = ("shift",)
-    shift: Array
-    """(d,), metres."""
+    shift: Array  # (d,), metres
 
     @property
     def dim(self) -> int:
@@ -142,10 +138,8 @@ class OnPlaces(Diffeomorphism):
     """A diffeomorphism of places as one of states, (y, s, a) ↦ (ψ(y), s, a), so that it can be stacked on a shear."""
 
     SCALED = ("transform",)
-    transform: Diffeomorphism
-    """ψ."""
-    num_rest: int
-    """Number of the coordinates that stay."""
+    transform: Diffeomorphism  # ψ
+    num_rest: int  # number of the coordinates that stay
 
     @property
     def dim(self) -> int:
@@ -165,10 +159,8 @@ class PhasedAttractor(Attractor):
     Motions are known in closed form, and ‖(x − x_e, s)‖ falls along all of them. `goal` is (x_e, 0), and any condition.
     """
 
-    predictions: Predictions
-    """They give the clocks."""
-    power: float = 3.0
-    """p: with a large one, what leads off the motion fades early."""
+    predictions: Predictions  # they give the clocks
+    power: float = 3.0  # p: with a large one, what leads off the motion fades early
 
     def states(self, places: Array, label: float | None = None, like: Array | None = None) -> Array:
         states, end = self.predictions.states(places, label), 2 * self.predictions.dim + 1
@@ -266,12 +258,9 @@ class Frozen(Attractor):
     Its streamlines, straight rays again, show where a motion at this phase is heading, not where it ends.
     """
 
-    gain: float
-    """1/s."""
-    moving: PhasedAttractor
-    """The whole system, whose potential is meant."""
-    rest: Array
-    """(1 + c,) phase, metres, and condition."""
+    gain: float  # 1/s
+    moving: PhasedAttractor  # the whole system, whose potential is meant
+    rest: Array  # (1 + c,) phase, metres, and condition
 
     def potential(self, z: Array) -> Array:
         """Φ of the whole system at this phase, (*B,)."""

@@ -95,8 +95,7 @@ class Flow(Diffeomorphism):
     field: VectorField
     duration: float = 1.0
     steps: int = 8
-    method: int = RK4
-    """Method of `dt_viz.flows.integrators`."""
+    method: int = RK4  # method of `dt_viz.flows.integrators`
     inverse_method: int | None = None
     """Method for ψ⁻¹; None takes `method`. `IMPLICIT_EULER` with `EULER` gives an inverse exact to rounding."""
     tolerance: float = 0.0
@@ -176,10 +175,8 @@ class Conjugated(Diffeomorphism):
     """h⁻¹∘ψ∘h: ψ acts in the coordinates h(y). Scaling it scales ψ and leaves the coordinates as they are."""
 
     SCALED = ("inner",)
-    inner: Diffeomorphism
-    """ψ."""
-    by: Diffeomorphism
-    """h."""
+    inner: Diffeomorphism  # ψ
+    by: Diffeomorphism  # h
 
     @property
     def dim(self) -> int:
@@ -201,12 +198,9 @@ class Placed(Diffeomorphism):
 
     SCALED = ("inner",)
     inner: Diffeomorphism
-    origin: Array
-    """o, (d,), metres."""
-    axes: Array
-    """R, (d, d), orthonormal columns: the frame's axes in the world."""
-    scale: float = 1.0
-    """World metres for one unit of `inner`."""
+    origin: Array  # o, (d,), metres
+    axes: Array  # R, (d, d), orthonormal columns: the frame's axes in the world
+    scale: float = 1.0  # world metres for one unit of `inner`
 
     @property
     def dim(self) -> int:
@@ -233,8 +227,7 @@ class Placed(Diffeomorphism):
 
 Method = Literal["auto", "rk4", "euler"]
 """`auto` keeps the result exact to a tolerance; the others take equal steps, Euler's being the paper's."""
-MAX_STEPS, MOST_STEPS = 50, 1000
-"""Largest numbers of steps of a flow: on the page, and at all."""
+MAX_STEPS, MOST_STEPS = 50, 1000  # largest numbers of steps of a flow: on the page, and at all
 
 
 @dataclass(frozen=True)

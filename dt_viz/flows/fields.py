@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dt_viz.kernels.dormand_prince import RATE
-from dt_viz.kernels.fields import GRID, TERM, Terms
+from dt_viz.kernels.fields import GRID, LANES, TERM, Terms
 from dt_viz.kernels.flows import carry
+from dt_viz.kernels.runge_kutta import DORMAND_PRINCE, RATE
+from dt_viz.memo import cached_property
 from dt_viz.numerics import Array, Indices, Mask  # noqa: F401 - other packages import them with the fields
+from dt_viz.scheduler import checkpoint
+
+MOST_AT_ONCE = 2 * 10**8
+"""Largest product of points, equal steps and values of a field between two checkpoints: about a second."""
 
 
 class VectorField(Protocol):
@@ -73,7 +77,13 @@ class PointField(ABC):
         states[:, :d] = s
         if U is not None:
             states[:, d:] = U.reshape(num, states.shape[1] - d)
-        num_failed = carry(self.terms, states, d, method, float(duration), int(steps), float(tolerance))
+        num_failed, equal_steps = 0, 1 if method == DORMAND_PRINCE else steps
+        rows = LANES * max(1, MOST_AT_ONCE // (LANES * equal_steps * max(1, self.terms.values.size)))
+        for begin in range(0, num, rows):
+            if num > rows:
+                checkpoint()
+            block = states[begin : begin + rows]
+            num_failed += carry(self.terms, block, d, method, float(duration), int(steps), float(tolerance))
         if num_failed:
             text = f"{num_failed} points need more than {steps} steps: the field is too steep for them"
             raise ArithmeticError(text)
@@ -85,14 +95,12 @@ class GaussianGrid:
     """Gaussian basis k(s, ŝ) = exp(−ℓ‖s − ŝ‖²) with inducing points ŝ on an equally spaced grid (sec. 5).
 
     A Gaussian is a product of 1-D Gaussians, so a weighted sum over all inducing points is contracted one axis after
-    the other (`dt_viz.kernels.gaussians`); no (N, m) matrix of exponentials is formed.
+    the other (`dt_viz.kernels.fields`); no (N, m) matrix of exponentials is formed.
     """
 
-    axes: tuple[Array, ...]
-    """Per axis the n_j increasing coordinates of the inducing points."""
+    axes: tuple[Array, ...]  # per axis the n_j increasing coordinates of the inducing points
 
-    ell: float
-    """Inverse squared width ℓ = 1/(2σ²), in 1/unit²."""
+    ell: float  # inverse squared width ℓ = 1/(2σ²), in 1/unit²
 
     @classmethod
     def covering(cls, points: ArrayLike, sigma: float, *, spacing: float = 1.0, pad: float = 1.0) -> GaussianGrid:
@@ -166,8 +174,7 @@ class GridRBF(PointField):
     """Point field V(s) = Wᵀ k(s, ŝ) on a Gaussian grid (sec. 4.3; the printed kernel with its norm squared)."""
 
     grid: GaussianGrid
-    weights: Array
-    """W, (m, d), one row for each inducing point."""
+    weights: Array  # W, (m, d), one row for each inducing point
 
     def __post_init__(self) -> None:
         expected = (self.grid.num_points, self.grid.dim)
@@ -192,8 +199,7 @@ class PlacedField(PointField):
     """
 
     inner: PointField
-    origin: Array
-    """o, (d,), metres."""
+    origin: Array  # o, (d,), metres
     axes: Array
     """M, (d, d), invertible; its columns are the axes of the frame of `inner`, one unit long, metres."""
 
@@ -222,8 +228,7 @@ class Projected(PointField):
     """The part M·V of a field that a matrix leaves, such as that along a plane: its flow then stays at every depth."""
 
     inner: PointField
-    matrix: Array
-    """M, (d, d)."""
+    matrix: Array  # M, (d, d)
 
     @property
     def dim(self) -> int:

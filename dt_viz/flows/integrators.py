@@ -11,8 +11,8 @@ import numpy as np
 from scipy.integrate import RK45
 
 from dt_viz.flows.fields import Array, CompiledField, PointField, VectorField
-from dt_viz.kernels.dormand_prince import DORMAND_PRINCE, EULER, RK4
 from dt_viz.kernels.flows import IMPLICIT_EULER
+from dt_viz.kernels.runge_kutta import DORMAND_PRINCE, EULER, RK4
 from dt_viz.numerics import divisor
 
 __all__ = ["DORMAND_PRINCE", "EULER", "IMPLICIT_EULER", "RK4", "carried"]
@@ -39,7 +39,7 @@ def carried(
         duration: of the flow.
         steps: number of equal steps, or largest number of adaptive ones; more raise ArithmeticError.
         tolerance: largest estimated error of an adaptive step, in the unit of `s`; smaller in proportion where the
-            motion is short. That of tangents is `dt_viz.kernels.dormand_prince.TANGENT_TOLERANCE`.
+            motion is short. That of tangents is `dt_viz.kernels.runge_kutta.TANGENT_TOLERANCE`.
     """
     if isinstance(field, PointField):
         return field.carried(s, U, method, duration, steps, tolerance)

@@ -11,8 +11,7 @@ from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.systems import Attractor
 from dt_viz.metrics import arc_length
 
-ARRIVED = 1e-4
-"""Distance (m) from the goal in base space at which a motion counts as arrived."""
+ARRIVED = 1e-4  # distance (m) from the goal in base space at which a motion counts as arrived
 ARRIVING = 0.5
 """Upper bound of that distance, relative to that of the sample before: a stack may stretch it to a visible length."""
 UNEVEN = 1.5
@@ -32,8 +31,7 @@ class Rays:
     Those of a plain attractor are straight rays, z = z_e + (1 − u)(z₀ − z_e).
     """
 
-    z0: Array
-    """(R, d) starts in base space."""
+    z0: Array  # (R, d) starts in base space
     base: Attractor
 
     def at(self, index: Indices, fraction: Array) -> Array:
@@ -60,8 +58,7 @@ class Rays:
 class Bundle:
     """Sampled rollouts, one after the other, each from its start to its goal."""
 
-    index: Indices
-    """(N,) which rollout a sample belongs to, not decreasing."""
+    index: Indices  # (N,) which rollout a sample belongs to, not decreasing
     fraction: Array
     """(N,) fraction of the base ray that lies behind it, increasing within a rollout."""
     levels: Array

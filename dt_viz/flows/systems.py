@@ -20,12 +20,9 @@ class Attractor:
     sinh(r(t)/ρ) = sinh(r₀/ρ)·exp(−v·t/ρ) on the straight ray from z(0) to the goal.
     """
 
-    goal: Array
-    """z_e, (d,), metres."""
-    speed: float = 0.1
-    """v far from the goal, m/s."""
-    smoothing: float = 0.01
-    """ρ, metres: inside this distance the motion slows down to a stop."""
+    goal: Array  # z_e, (d,), metres
+    speed: float = 0.1  # v far from the goal, m/s
+    smoothing: float = 0.01  # ρ, metres: inside this distance the motion slows down to a stop
 
     @property
     def dim(self) -> int:
@@ -115,8 +112,7 @@ class DiffeomorphicSystem:
     ψ is a conjugacy: z = ψ(y) obeys ż = f(z) exactly, so it is as stable as its base, whose motions are mapped to its.
     """
 
-    transform: Diffeomorphism
-    """ψ, from the space of the motion to the space of the base attractor."""
+    transform: Diffeomorphism  # ψ, from the space of the motion to the space of the base attractor
     base: Attractor
 
     def velocity(self, y: Array) -> Array:

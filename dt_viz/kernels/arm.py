@@ -30,12 +30,9 @@ BODY_POINT = np.dtype(
 The spheres that hold no others cover the links. They are inside all that hold them, which bound their distances.
 """
 
-Array = NDArray[Any]
-"""Of floats, or of complex numbers for derivatives."""
-Joints = NDArray[Any]
-"""(n,) joints of dtype `JOINT`, from the base to the hand."""
-BodyPoints = NDArray[Any]
-"""(P,) body points of dtype `BODY_POINT`, not decreasing by joint."""
+Array = NDArray[Any]  # of floats, or of complex numbers for derivatives
+Joints = NDArray[Any]  # (n,) joints of dtype `JOINT`, from the base to the hand
+BodyPoints = NDArray[Any]  # (P,) body points of dtype `BODY_POINT`, not decreasing by joint
 
 
 @compiled

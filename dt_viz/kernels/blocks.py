@@ -10,24 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dt_viz.kernels.arm import Array, BodyPoints, Joints, holds_others
-from dt_viz.kernels.compiled import compiled, short_kernel
-from dt_viz.kernels.distances import (
-    BOX,
-    CYLINDER,
-    GRID,
-    SPHERE,
-    Record,
-    Shapes,
-    Values,
-    beyond_edge,
-    beyond_faces,
-    weight,
-)
+from dt_viz.kernels.compiled import compiled, short_kernel, unrolled
+from dt_viz.kernels.distances import GRID, KINDS, SPHERE, Record, Shapes, Values, from_surface, weight
 
-LANES = 16
-"""Number of postures in a block."""
-MOST_JOINTS = 8
-"""Largest number of joints of an arm."""
+LANES = 16  # number of postures in a block
+MOST_JOINTS = 8  # largest number of joints of an arm
 SPREAD = 2.0
 """Largest difference between a distance on a grid and its nearest node's, in cells, with room to spare."""
 
@@ -51,10 +38,8 @@ def block_of(*rows: tuple[str, tuple[int, ...]]) -> np.dtype:
     return np.dtype([(name, np.float64, (*shape, LANES)) for name, shape in (*kinematics, *rows)])
 
 
-BLOCK = block_of(("floor", ()), ("bound", ()))
-"""Memory for `clearance`."""
-Blocks = NDArray[np.void]
-"""(1,) block of such a dtype."""
+BLOCK = block_of(("floor", ()), ("bound", ()))  # memory for `clearance`
+Blocks = NDArray[np.void]  # (1,) block of such a dtype
 
 
 @compiled
@@ -149,29 +134,21 @@ def turning(axes: Array, i: int, lane: int, x: float, y: float, z: float) -> tup
 @compiled
 def measure(shape: Record, values: Values, radius: float, enough: float, block: Record) -> None:
     """Find the distance of a sphere about the place from an obstacle; from `enough` on, any not larger one will do."""
-    place, away, kind = block.place, block.away, shape.kind
+    place, away, axes, kind = block.place, block.away, shape.axes, shape.kind
     X, Y, Z = shape.position
     half_u, half_v, half_w = shape.half
-    axes = shape.axes
     if kind == GRID:
         _measure_on_grid(shape, values, radius, enough, block)
         return
     a, b, c, d, e, f = axes[0, 0], axes[1, 0], axes[2, 0], axes[0, 1], axes[1, 1], axes[2, 1]
     g, h, i = axes[0, 2], axes[1, 2], axes[2, 2]
-    if kind == SPHERE:
-        for lane in range(LANES):
-            x, y, z = place[0, lane] - X, place[1, lane] - Y, place[2, lane] - Z
-            away[lane] = np.sqrt(x * x + y * y + z * z) - half_u - radius
-    elif kind == BOX:
-        for lane in range(LANES):
-            x, y, z = place[0, lane] - X, place[1, lane] - Y, place[2, lane] - Z
-            u, v, w = abs(a * x + b * y + c * z), abs(d * x + e * y + f * z), abs(g * x + h * y + i * z)
-            away[lane] = beyond_faces(u - half_u, v - half_v, w - half_w) - radius
-    elif kind == CYLINDER:
-        for lane in range(LANES):
-            x, y, z = place[0, lane] - X, place[1, lane] - Y, place[2, lane] - Z
-            u, v, w = a * x + b * y + c * z, d * x + e * y + f * z, abs(g * x + h * y + i * z)
-            away[lane] = beyond_edge(np.sqrt(u * u + v * v) - half_u, w - half_w) - radius
+    for known in unrolled(KINDS):  # a loop over the lanes for each, without branches
+        if kind == known:
+            for lane in range(LANES):
+                u, v, w = place[0, lane] - X, place[1, lane] - Y, place[2, lane] - Z
+                if known != SPHERE:  # which needs no turn
+                    u, v, w = a * u + b * v + c * w, d * u + e * v + f * w, g * u + h * v + i * w
+                away[lane] = from_surface(known, half_u, half_v, half_w, u, v, w) - radius
 
 
 @compiled
@@ -239,7 +216,6 @@ def _measure_on_grid(shape: Record, values: Values, radius: float, enough: float
 
 @compiled
 def _largest(values: Array) -> float:
-    """Largest of the lanes' values."""
     most = values[0]
     for lane in range(LANES):
         most = values[lane] if values[lane] > most else most
@@ -248,7 +224,6 @@ def _largest(values: Array) -> float:
 
 @compiled
 def _least(values: Array) -> float:
-    """Smallest of the lanes' values."""
     least = values[0]
     for lane in range(LANES):
         least = values[lane] if values[lane] < least else least

@@ -13,16 +13,15 @@ from numpy.typing import NDArray
 
 from dt_viz.kernels.compiled import compiled, kernel
 
-SPHERE, BOX, CYLINDER, GRID = 0, 1, 2, 3
-"""Kinds of shapes."""
-
+KINDS = SPHERE, BOX, CYLINDER, CAPSULE = 0, 1, 2, 3  # of shapes that `from_surface` knows
+GRID = 4
 
 SHAPE = np.dtype(
     [
         ("kind", np.int64),
         ("position", np.float64, 3),  # origin of its own frame, metres
         ("axes", np.float64, (3, 3)),  # axes of that frame as columns
-        ("half", np.float64, 3),  # half sizes along them, metres; of a sphere the radius
+        ("half", np.float64, 3),  # half sizes along them, metres
         ("scale", np.float64),  # of a grid: metres for one unit of its frame, which the rest is in
         ("first", np.float64, 3),  # its first node
         ("cell", np.float64),  # distance between neighbouring nodes
@@ -35,14 +34,10 @@ SHAPE = np.dtype(
 )
 """An obstacle; what a kind does not have is zero."""
 
-Number = Any
-"""A float, or a complex number for derivatives."""
-Record = Any
-"""An element of an array of records, whose fields are attributes in compiled code."""
-Shapes = NDArray[Any]
-"""(K,) obstacles of dtype `SHAPE`."""
-Values = NDArray[np.float32]
-"""(V,) signed distances of the nodes of all grids, last axis fastest."""
+Number = Any  # a float, or a complex number for derivatives
+Record = Any  # an element of an array of records, whose fields are attributes in compiled code
+Shapes = NDArray[Any]  # (K,) obstacles of dtype `SHAPE`
+Values = NDArray[np.float32]  # (V,) signed distances of the nodes of all grids, last axis fastest
 
 
 @kernel
@@ -67,21 +62,33 @@ def batch(s: NDArray[Any]) -> NDArray[Any]:
 def distance(shape: Record, values: Values, x: Number, y: Number, z: Number) -> Number:
     """Distance of a point from the surface of an obstacle, metres, negative inside."""
     x, y, z = x - shape.position[0], y - shape.position[1], z - shape.position[2]
-    half, axes = shape.half, shape.axes
-    if shape.kind == SPHERE:
-        return np.sqrt(x * x + y * y + z * z) - half[0]
+    axes = shape.axes
     u = axes[0, 0] * x + axes[1, 0] * y + axes[2, 0] * z
     v = axes[0, 1] * x + axes[1, 1] * y + axes[2, 1] * z
     w = axes[0, 2] * x + axes[1, 2] * y + axes[2, 2] * z
-    if shape.kind == BOX:
-        return beyond_faces(_magnitude(u) - half[0], _magnitude(v) - half[1], _magnitude(w) - half[2])
-    if shape.kind == CYLINDER:
-        return beyond_edge(np.sqrt(u * u + v * v) - half[0], _magnitude(w) - half[2])
-    return shape.scale * _on_grid(shape, values, u / shape.scale, v / shape.scale, w / shape.scale)
+    if shape.kind == GRID:
+        return shape.scale * _on_grid(shape, values, u / shape.scale, v / shape.scale, w / shape.scale)
+    return from_surface(shape.kind, shape.half[0], shape.half[1], shape.half[2], u, v, w)
 
 
 @compiled
-def beyond_faces(x: Number, y: Number, z: Number) -> Number:
+def from_surface(kind: int, a: float, b: float, c: float, u: Number, v: Number, w: Number) -> Number:
+    """Distance of a point (u, v, w) from the surface of a shape of half sizes (a, b, c) about 0, negative inside."""
+    if kind == SPHERE:
+        return np.sqrt(u * u + v * v + w * w) - a
+    u, v, w = _magnitude(u), _magnitude(v), _magnitude(w)
+    if kind == BOX:
+        return _beyond_faces(u - a, v - b, w - c)
+    if kind == CYLINDER:
+        return _beyond_edge(np.sqrt(u * u + v * v) - a, w - c)
+    if kind == CAPSULE:
+        along = _positive(w - (c - a))
+        return np.sqrt(u * u + v * v + along * along) - a
+    return np.nan * u
+
+
+@compiled
+def _beyond_faces(x: Number, y: Number, z: Number) -> Number:
     """Distance from a box by the excess of each coordinate over its half size."""
     deepest = _larger(_larger(x, y), z)
     if deepest.real <= 0:
@@ -91,7 +98,7 @@ def beyond_faces(x: Number, y: Number, z: Number) -> Number:
 
 
 @compiled
-def beyond_edge(across: Number, along: Number) -> Number:
+def _beyond_edge(across: Number, along: Number) -> Number:
     """Distance from a cylinder by the excess across and along its axis."""
     deepest = _larger(across, along)
     if deepest.real <= 0:

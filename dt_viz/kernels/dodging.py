@@ -20,37 +20,24 @@ class LimitedArm(NamedTuple):
     """An arm and its limits."""
 
     joints: Joints
-    points: BodyPoints
-    """Of its links."""
-    lower: Array
-    """(n,) smallest angles, rad."""
-    upper: Array
-    """(n,) largest angles, rad."""
-    fastest: Array
-    """(n,) largest velocities, rad/s."""
-    acceleration: float
-    """Largest one, rad/s²."""
+    points: BodyPoints  # of its links
+    lower: Array  # (n,) smallest angles, rad
+    upper: Array  # (n,) largest angles, rad
+    fastest: Array  # (n,) largest velocities, rad/s
+    acceleration: float  # largest one, rad/s²
 
 
 class Forecast(NamedTuple):
     """Where obstacles are going to be."""
 
-    shapes: Shapes
-    """(P,) obstacles."""
-    values: Values
-    """Of their grids."""
-    times: Array
-    """(T,) at which distances are looked at, seconds from now."""
-    moved: Array
-    """(T, P, 3) displacement until then, metres."""
-    deviation: Array
-    """(T, P) deviation from there, metres."""
-    kept: float
-    """Distance that is kept, metres."""
-    floor: float
-    """Height that is kept, metres."""
-    depth: float
-    """Depth below it that counts as much as one deviation, metres."""
+    shapes: Shapes  # (P,) obstacles
+    values: Values  # of their grids
+    times: Array  # (T,) at which distances are looked at, seconds from now
+    moved: Array  # (T, P, 3) displacement until then, metres
+    deviation: Array  # (T, P) deviation from there, metres
+    kept: float  # distance that is kept, metres
+    floor: float  # height that is kept, metres
+    depth: float  # depth below it that counts as much as one deviation, metres
 
 
 @compiled

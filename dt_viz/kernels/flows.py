@@ -10,15 +10,11 @@ from __future__ import annotations
 import numpy as np
 
 from dt_viz.kernels.compiled import compiled, inlined, kernel
-from dt_viz.kernels.dormand_prince import carry_explicitly
-from dt_viz.kernels.fields import FieldWork, Terms, field_work, velocity
-from dt_viz.kernels.gaussians import LANES, Array
-from dt_viz.kernels.runge_kutta import add, copy, load, moving, rates, store
+from dt_viz.kernels.fields import LANES, Array, FieldWork, Terms, field_work, velocity
+from dt_viz.kernels.runge_kutta import add, carry_explicitly, copy, load, moving, rates, store
 
-IMPLICIT_EULER = 4
-"""A method beside those of `dt_viz.kernels.dormand_prince`."""
-MAX_ITERATIONS = 200
-"""Largest number of Newton's iterations for a step of implicit Euler."""
+IMPLICIT_EULER = 4  # a method beside those of `dt_viz.kernels.runge_kutta`
+MAX_ITERATIONS = 200  # largest number of Newton's iterations for a step of implicit Euler
 
 
 @compiled

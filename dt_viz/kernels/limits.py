@@ -9,14 +9,11 @@ from dt_viz.kernels.compiled import compiled, short_kernel
 from dt_viz.kernels.dodging import LimitedArm
 from dt_viz.kernels.proximity import Indices
 
-NUM_ROWS = 8
-"""Number of distances, the smallest ones, that have a barrier."""
+NUM_ROWS = 8  # number of distances, the smallest ones, that have a barrier
 BRAKING_SHARE = 0.8
 """Part of the acceleration limit that braking before a joint limit counts on: ticks are not infinitely short."""
-IMMOBILE = 1e-4
-"""Squared slope of a distance, m²/rad², up to which no joint changes it to speak of."""
-STEADIEST = 0.5
-"""Part of a distance that goes in one tick at most, however long it is."""
+IMMOBILE = 1e-4  # squared slope of a distance, m²/rad², up to which no joint changes it to speak of
+STEADIEST = 0.5  # part of a distance that goes in one tick at most, however long it is
 
 
 @compiled

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dt_viz.kernels.arm import Array, BodyPoints, Joints, chain, holds_others, placed
-from dt_viz.kernels.compiled import compiled, short_kernel
+from dt_viz.kernels.compiled import compiled, kernel, short_kernel
 from dt_viz.kernels.distances import Record, Shapes, Values, distance
 
 COMPLEX_STEP = 1e-30
@@ -187,3 +188,19 @@ def _from_sphere(
             nearest, away = gap, (u / length, v / length, w / length)
         i = i + 1 if gap < nearest else points[i].end
     return nearest, away
+
+
+@kernel
+def step_to_the_farthest(centre: Array, spheres: Array, num: int) -> None:
+    """Move a centre (3,) `num` times towards the farthest of the spheres (N, 4), by ever smaller parts of the way."""
+    for step in range(2, num + 2):
+        farthest, longest, length = 0, -1.0, 0.0
+        for k in range(len(spheres)):
+            x, y, z = spheres[k, 0] - centre[0], spheres[k, 1] - centre[1], spheres[k, 2] - centre[2]
+            apart = math.sqrt(x * x + y * y + z * z)
+            if apart + spheres[k, 3] > longest:
+                farthest, longest, length = k, apart + spheres[k, 3], apart
+        if length:
+            part = 1 + spheres[farthest, 3] / length
+            for axis in range(3):
+                centre[axis] += (spheres[farthest, axis] - centre[axis]) * part / step

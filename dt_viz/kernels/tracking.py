@@ -11,7 +11,47 @@ from dt_viz.kernels.arm import Array, Joints
 from dt_viz.kernels.blocks import LANES, MOST_JOINTS, block_of, chain, keep, load, put, turning
 from dt_viz.kernels.compiled import compiled, kernel
 from dt_viz.kernels.distances import Record
-from dt_viz.kernels.symmetric import invert, product, times
+
+
+@compiled
+def times(matrix: Array, lane: int, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Multiply the symmetric matrix of a lane by a vector."""
+    a, b, c = matrix[0, lane], matrix[1, lane], matrix[2, lane]
+    f, g, h = matrix[3, lane], matrix[4, lane], matrix[5, lane]
+    return a * x + h * y + g * z, h * x + b * y + f * z, g * x + f * y + c * z
+
+
+@compiled
+def product(n: int, A: Array, B: Array, block: Record) -> None:
+    """Find the symmetric matrix AᵀB of arrays (n, 3, LANES)."""
+    matrix = block.matrix
+    matrix[:] = 0
+    for i in range(n):
+        for lane in range(LANES):
+            matrix[0, lane] += A[i, 0, lane] * B[i, 0, lane]
+            matrix[1, lane] += A[i, 1, lane] * B[i, 1, lane]
+            matrix[2, lane] += A[i, 2, lane] * B[i, 2, lane]
+            matrix[3, lane] += A[i, 1, lane] * B[i, 2, lane]
+            matrix[4, lane] += A[i, 0, lane] * B[i, 2, lane]
+            matrix[5, lane] += A[i, 0, lane] * B[i, 1, lane]
+
+
+@compiled
+def invert(block: Record) -> None:
+    """Find the inverse of `matrix` + `damping`·I by cofactors."""
+    matrix, inverse, damping = block.matrix, block.inverse, block.damping
+    for lane in range(LANES):
+        a, b, c = matrix[0, lane] + damping[lane], matrix[1, lane] + damping[lane], matrix[2, lane] + damping[lane]
+        f, g, h = matrix[3, lane], matrix[4, lane], matrix[5, lane]
+        x, y, z = b * c - f * f, f * g - h * c, h * f - g * b
+        scale = 1 / (a * x + h * y + g * z)
+        inverse[0, lane], inverse[1, lane], inverse[2, lane] = (
+            x * scale,
+            (a * c - g * g) * scale,
+            (a * b - h * h) * scale,
+        )
+        inverse[3, lane], inverse[4, lane], inverse[5, lane] = (g * h - a * f) * scale, z * scale, y * scale
+
 
 BLOCK = block_of(
     ("target", (3,)),  # metres
@@ -46,16 +86,12 @@ class TrackingArm(NamedTuple):
     """An arm of n joints."""
 
     joints: Joints
-    hand: Array
-    """(3,) position of the end effector in the last joint, metres."""
-    axis: Array
-    """(3,) direction of the hand there, of any length but 0."""
-    lower: Array
-    """(n,) rad."""
-    upper: Array
-    """(n,) rad."""
+    hand: Array  # (3,) position of the end effector in the last joint, metres
+    axis: Array  # (3,) direction of the hand there, of any length but 0
+    lower: Array  # (n,) rad
+    upper: Array  # (n,) rad
     limit_weight: float
-    """This and what follows are fields of `dt_viz.robot.tracking_settings.TrackingSettings`."""
+    """This and what follows are fields of `dt_viz.robot.robot.TrackingSettings`."""
     damping_floor: float
     damping_per_error: float
     curvature: float
@@ -65,14 +101,10 @@ class TrackingArm(NamedTuple):
 class Postures(NamedTuple):
     """B secondary objectives in the null space."""
 
-    reference: Array
-    """(B, n) rad."""
-    direction: Array
-    """(B, 3) unit vectors, base frame."""
-    soft_lower: Array
-    """(B, n) rad, starts of the springs before the limits."""
-    soft_upper: Array
-    """(B, n) rad."""
+    reference: Array  # (B, n) rad
+    direction: Array  # (B, 3) unit vectors, base frame
+    soft_lower: Array  # (B, n) rad, starts of the springs before the limits
+    soft_upper: Array  # (B, n) rad
     direction_weight: Array
     """(B,) w_d, against 1 for the reference; of the orientation where one is wanted."""
 

@@ -7,10 +7,8 @@ import numpy as np
 from dt_viz.kernels.arm import Array
 from dt_viz.kernels.compiled import compiled, short_kernel
 
-NUM_BALL_RINGS = 6
-"""Number of rings of a ball."""
-BEND = 0.03
-"""Length of a path that needs as many rings as a turn by one radian, metres."""
+NUM_BALL_RINGS = 6  # number of rings of a ball
+BEND = 0.03  # length of a path that needs as many rings as a turn by one radian, metres
 
 
 @compiled

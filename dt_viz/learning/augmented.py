@@ -14,7 +14,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from numbers import Real
 from typing import ClassVar, TypeVar
 
@@ -26,12 +26,12 @@ from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.rotations import exponential, nearest, turned
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem, asinh_exp, log_sinh
 from dt_viz.learning.demonstrations import Demonstration
-from dt_viz.learning.grouping import patterns_of, set_apart, told_by_starts
 from dt_viz.learning.initial_guess import groups_of
 from dt_viz.learning.interface import AnyImitation, State
-from dt_viz.learning.patterns import AugmentedSettings, Pattern, learn_patterns
+from dt_viz.learning.patterns import AugmentedSettings, Pattern, learn_patterns, patterns_of, set_apart, told_by_starts
 from dt_viz.learning.preparation import ImitationError, Motions, prepare
 from dt_viz.learning.timing import ARRIVED, TimedAttractor
+from dt_viz.memo import cached_property
 from dt_viz.metrics import arc_length
 
 _T = TypeVar("_T")
@@ -47,19 +47,15 @@ class AugmentedImitation(AnyImitation):
     """
 
     state: ClassVar[State] = "augmented"
-    top: float
-    """s_max, metres."""
+    top: float  # s_max, metres
     patterns: tuple[Pattern, ...]
-    pattern_of: Indices
-    """(R,) index of the pattern of each start."""
+    pattern_of: Indices  # (R,) index of the pattern of each start
     numbers: tuple[int, ...]
     """Numbers of the demonstrations, of those that were given, that the starts are of."""
     plain_clock: TimedAttractor
     """Clock of the phase, without the pace that is predicted for a start."""
-    radius: float = 0.0
-    """Length that a turn of the hand by one radian counts, metres."""
-    posed: bool = False
-    """Whether the states are those of poses."""
+    radius: float = 0.0  # length that a turn of the hand by one radian counts, metres
+    posed: bool = False  # whether the states are those of poses
 
     @property
     def dim(self) -> int:
@@ -335,3 +331,49 @@ def _plain_clock(top: float, duration: float, num_knots: int) -> TimedAttractor:
         knots=np.linspace(nearest, farthest, num_knots),
         paces=np.ones((1, num_knots)),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Style:
+    """How a styled motion differs from a plain-handed one of the same action."""
+
+    offsets: Array
+    """(K, d) d at the knots of a motion, from its start, in units of s_max; zero at both ends, which stay."""
+
+    @classmethod
+    def between(cls, usual: AugmentedImitation, styled: AugmentedImitation) -> Style:
+        """What leads from the usual motion of an action to the styled one.
+
+        Raises:
+            ImitationError: they do not have as many coordinates, or one shows several patterns: it has no mean motion.
+        """
+        _check(len(usual.goal), len(styled.goal))
+        num = max(len(one.patterns) for one in (usual, styled))
+        if num > 1:
+            raise ImitationError(f"style: found a hand of {num} patterns; accepted: 1, demonstrations of one figure")
+        means = [one.patterns[0].mean / one.top for one in (usual, styled)]
+        num_knots = max(len(mean) for mean in means)
+        before, after = (_at_knots(mean, num_knots) for mean in means)
+        offsets = (after - after[-1]) - (before - before[-1])
+        return cls(offsets - np.linspace(1, 0, len(offsets))[:, None] * offsets[0])
+
+    def on(self, imitation: AugmentedImitation, amount: float) -> AugmentedImitation:
+        """A motion of any action in this style, of which a part is put on; a negative amount is taken off.
+
+        Raises:
+            ImitationError: it has more or fewer coordinates.
+        """
+        _check(self.offsets.shape[1], len(imitation.goal))
+        moved = amount * imitation.top * _at_knots(self.offsets, len(imitation.patterns[0].mean))
+        patterns = tuple(replace(pattern, mean=pattern.mean + moved) for pattern in imitation.patterns)
+        return replace(imitation, patterns=patterns, reason="a style is put on it")
+
+
+def _at_knots(values: Array, num: int) -> Array:
+    """Values (K, d) at even knots, at `num` of them."""
+    return PhaseCurve.through(np.linspace(0, 1, len(values)), values).at(np.linspace(0, 1, num))
+
+
+def _check(wanted: int, found: int) -> None:
+    if found != wanted:
+        raise ImitationError(f"style: found a motion of {found} coordinates; accepted: {wanted}, as the style has")

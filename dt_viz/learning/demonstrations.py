@@ -25,14 +25,11 @@ logger = logging.getLogger(__name__)
 
 DIMENSIONS = (2, 3)
 MAX_DEMONSTRATIONS = 1000
-MAX_NAME = 1000
-"""Largest number of characters of a name."""
+MAX_NAME = 1000  # largest number of characters of a name
 MAX_COORDINATE, MAX_DURATION = 100.0, 3600.0
 """Largest coordinate (m) and duration (s); numbers beyond them are in another unit."""
-MIN_EXTENT = 1e-6
-"""Smallest extent of a motion, metres; a smaller one is a point."""
-Found = tuple[Path, Sequence[Take], Sequence[str]]
-"""A file, its takes, and notes about them."""
+MIN_EXTENT = 1e-6  # smallest extent of a motion, metres; a smaller one is a point
+Found = tuple[Path, Sequence[Take], Sequence[str]]  # a file, its takes, and notes about them
 Places = Sequence[Callable[[int], str]]
 """For each demonstration, what describes the place of a sample in its file."""
 
@@ -275,7 +272,6 @@ def demonstrations_of(
 
 
 def _found_in(path: Path, options: ReadOptions) -> list[Found]:
-    """Read a file, or the files of a folder."""
     with parsing(DemonstrationError, path, "path", "a readable file or folder"):
         if not path.exists():
             raise FormatError("path", "no such file or folder", "a readable file or folder")

@@ -26,10 +26,8 @@ class FlowLayer:
     """Features of one stationary field: the Gaussians of a grid that are near the data."""
 
     grid: GaussianGrid
-    active: NDArray[np.integer[Any]]
-    """(m,) indices into the grid's inducing points."""
-    whitening: Array
-    """C⁻ᵀ, (m, m)."""
+    active: NDArray[np.integer[Any]]  # (m,) indices into the grid's inducing points
+    whitening: Array  # C⁻ᵀ, (m, m)
 
     @classmethod
     def near(cls, points: Array, sigma: float, *, spacing: float, reach: float) -> FlowLayer:
@@ -94,8 +92,7 @@ class FlowChain:
     """ψ⁻¹ as a chain of layers; layer 0 acts first. Coefficients are lists of L arrays (m_l, d)."""
 
     layers: tuple[FlowLayer, ...]
-    steps: int
-    """Number of Euler steps of each layer."""
+    steps: int  # number of Euler steps of each layer
 
     @property
     def dim(self) -> int:

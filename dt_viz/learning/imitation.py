@@ -5,14 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import partial
 from itertools import count
 from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 
 from dt_viz.errors import FormatError
-from dt_viz.files.checks import real_numbers
+from dt_viz.files.checks import check_at_most, real_numbers
 from dt_viz.flows.diffeomorphisms import (
     MOST_STEPS,
     Chain,
@@ -25,7 +25,7 @@ from dt_viz.flows.diffeomorphisms import (
 from dt_viz.flows.fields import Array, GaussianGrid, GridRBF
 from dt_viz.flows.integrators import EULER, IMPLICIT_EULER
 from dt_viz.flows.systems import DiffeomorphicSystem
-from dt_viz.learning.demonstrations import DIMENSIONS, Demonstration
+from dt_viz.learning.demonstrations import DIMENSIONS, MAX_DEMONSTRATIONS, Demonstration
 from dt_viz.learning.flow_chain import FlowChain, FlowLayer, equally_spaced_grid, scaled_field
 from dt_viz.learning.initial_guess import groups_of, layers_along, regress, unbending
 from dt_viz.learning.interface import AnyImitation, State
@@ -33,6 +33,7 @@ from dt_viz.learning.preparation import ImitationError, Motions, PreparationSett
 from dt_viz.learning.timing import TimedAttractor, TimingSettings, learn_timing
 from dt_viz.learning.trajectory import TrajectoryFit
 from dt_viz.learning.velocity import VelocityFit
+from dt_viz.memo import cached_property
 from dt_viz.metrics import interpolate
 
 Progress = Callable[[float, str], None]
@@ -40,6 +41,10 @@ Progress = Callable[[float, str], None]
 Objective = Literal["trajectory", "velocity"]
 """Objective of a fit: the rollouts themselves, or the velocities at the demonstrations' points (eq. (3))."""
 OBJECTIVES: tuple[Objective, ...] = get_args(Objective)
+MAX_ALL_STEPS, MAX_GAUSSIANS = 1000, 2 * 10**6
+"""Largest numbers of steps of all flows of a fit that is read, and of Gaussians of their fields, once for each step. A
+fit has up to 160 steps; of a wound motion in space, which takes a quarter of an hour, 530,000 Gaussians."""
+MAX_KNOTS = 200  # largest number of knots of the timing of a fit that is read; see `TimingSettings`
 
 
 @dataclass(frozen=True)
@@ -100,18 +105,21 @@ class Imitation(AnyImitation):
     """A motion learned in the plain state: ψ and the base attractor, with certificates."""
 
     state: ClassVar[State] = "plain"
-    transform: Chain
-    """ψ, from the space of the demonstrations to the space of the base attractor."""
-    base: TimedAttractor
-    """The base system; its goal is z_e = ψ(goal)."""
+    transform: Chain  # ψ, from the space of the demonstrations to the space of the base attractor
+    base: TimedAttractor  # the base system; its goal is z_e = ψ(goal)
     min_det_jacobian: float
     """Smallest det J over the demonstrations' box grown by half its size on every side."""
-    round_trip_error: float
-    """Largest ‖ψ⁻¹(ψ(x)) − x‖ over the same box."""
+    round_trip_error: float  # largest ‖ψ⁻¹(ψ(x)) − x‖ over the same box
 
     @cached_property
     def system(self) -> DiffeomorphicSystem:
         return DiffeomorphicSystem(self.transform, self.base)
+
+    @property
+    def num_gaussians(self) -> int:
+        """Number of Gaussians of all flows' fields, once for each step: what an image of ψ⁻¹ takes."""
+        flows = [flow for flow in self.transform.parts if isinstance(flow, Flow)]
+        return sum(flow.steps * flow.field.grid.num_points for flow in flows if isinstance(flow.field, GridRBF))
 
     def system_in(self, origin: Array, axes: Array, scale: float) -> DiffeomorphicSystem:
         base = self.base.placed(origin, axes[:, : len(self.goal)], scale)
@@ -144,6 +152,7 @@ class Imitation(AnyImitation):
         d = int(np.size(arrays.get("goal", ())))
         goal = _finite(arrays, "goal", d)
         flows: list[Diffeomorphism] = []
+        num_steps = 0
         while f"layer_{len(flows)}_weights" in arrays:
             prefix = f"layer_{len(flows)}_"
             ell, steps, forward = _finite(arrays, f"{prefix}ell_steps_forward", 3)
@@ -155,6 +164,8 @@ class Imitation(AnyImitation):
             if not (ell > 0 and 1 <= steps <= MOST_STEPS and forward in (0, 1)):
                 found = f"ℓ = {ell:g} and {steps:g} steps"
                 raise FormatError(f"{prefix}ell_steps_forward", found, f"ℓ above 0 and 1 to {MOST_STEPS} steps")
+            num_steps += int(steps)
+            check_at_most("steps of what was learned", num_steps, MAX_ALL_STEPS)
             field = GridRBF(grid, _finite(arrays, f"{prefix}weights", grid.num_points, d))
             integrators = (EULER, IMPLICIT_EULER) if forward else (IMPLICIT_EULER, EULER)
             flows.append(Flow(field, 1.0, int(steps), *integrators))
@@ -162,11 +173,13 @@ class Imitation(AnyImitation):
             raise FormatError("imitation", f"{d} coordinates and {len(flows)} layers", "2 or 3 coordinates, layers")
         *base, speed, smoothing = _finite(arrays, "base", d + 2)
         knots, directions = _finite(arrays, "base_knots", None), _finite(arrays, "base_directions", None, d)
+        check_at_most("base_knots", len(knots), MAX_KNOTS)
+        check_at_most("base_directions", len(directions), MAX_DEMONSTRATIONS)
         paces = _finite(arrays, "base_paces", len(directions), len(knots))
         if not (len(knots) > 1 and (np.diff(knots) > 0).all() and min(speed, smoothing, paces.min(initial=1.0)) > 0):
             raise FormatError("base", "a pace, speed or width of 0 or below, or knots that do not increase", "above 0")
         seconds, min_det, error = (float(x) for x in _finite(arrays, "certificates", 3))
-        return cls(
+        read = cls(
             transform=Chain(flows),
             base=TimedAttractor(
                 np.array(base), float(speed), float(smoothing), directions=directions, knots=knots, paces=paces
@@ -178,6 +191,8 @@ class Imitation(AnyImitation):
             round_trip_error=error,
             warnings=tuple(str(w) for w in np.ravel(arrays.get("warnings", ()))),
         )
+        check_at_most("Gaussians of what was learned, in all steps", read.num_gaussians, MAX_GAUSSIANS)
+        return read
 
 
 def _finite(arrays: Mapping[str, Array], name: str, *shape: int | None) -> Array:
@@ -357,7 +372,6 @@ def _width(motions: Motions, settings: ImitationSettings) -> float:
 
 
 def _strayed(motions: Motions, system: DiffeomorphicSystem, most: float) -> list[str]:
-    """Return a warning for each motion that its rollout does not follow."""
     warnings = []
     for name, times, path in zip(motions.names, motions.times, motions.positions, strict=True):
         at = np.linspace(0, len(times) - 1, min(len(times), 100)).astype(int)

@@ -15,11 +15,11 @@ import numpy as np
 from scipy.linalg import solveh_banded
 from scipy.spatial.transform import Slerp
 
-from dt_viz.checkpoints import checkpoint
 from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.flows.rotations import quaternions, rotation
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.metrics import arc_length, interpolate
+from dt_viz.scheduler import checkpoint
 from dt_viz.warning import in_millimetres
 
 FindingKind = Literal["units", "outliers", "gap", "jitter", "pause", "still", "elsewhere", "end", "start", "turn"]
@@ -134,8 +134,7 @@ class Repaired:
     positions: Array
     findings: list[Finding] = field(default_factory=list)
     kept: bool = True
-    jitter: float = 0.0
-    """RMS of what was smoothed, metres."""
+    jitter: float = 0.0  # RMS of what was smoothed, metres
 
     def __post_init__(self) -> None:
         self._given = self.times, self.positions
@@ -227,7 +226,6 @@ def _find_outliers(take: Repaired, settings: PreparationSettings) -> None:
 
 
 def _smooth(take: Repaired, settings: PreparationSettings) -> None:
-    """Bridge gaps and smooth jitter, as far as there are any."""
     if len(take.times) < 8:
         return
     gaps, curved = _gaps(take, settings)

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import ClassVar, Literal, get_args
 
 from dt_viz.flows.fields import Array
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.patterns import AugmentedSettings
+from dt_viz.memo import cached_property
 from dt_viz.numerics import ZERO
 
-State = Literal["auto", "plain", "augmented"]
-"""State that a motion is learned in."""
+State = Literal["auto", "plain", "augmented"]  # state that a motion is learned in
 STATES: tuple[State, ...] = get_args(State)
 
 
@@ -21,13 +20,11 @@ STATES: tuple[State, ...] = get_args(State)
 class StateChoice:
     """How far demonstrations that were left out are from what the others teach: mean Fréchet distances, metres."""
 
-    plain: float
-    """In the plain state; infinite where that fails."""
+    plain: float  # in the plain state; infinite where that fails
     augmented: float
     shifted_mean: float
     """Of the mean of the others, shifted to the start by an offset that fades: what takes no learning."""
-    num: int
-    """Number of demonstrations that were left out, before it was clear."""
+    num: int  # number of demonstrations that were left out, before it was clear
 
     def __str__(self) -> str:
         off = ", ".join(
@@ -41,12 +38,9 @@ class StateChoice:
 class AnyImitation(ABC):
     """A learned motion, in the demonstrations' own units."""
 
-    state: ClassVar[State]
-    """State that it was learned in."""
-    starts: Array
-    """(R, d) starts of the demonstrations, metres."""
-    goal: Array
-    """(d,) common end of the demonstrations, metres."""
+    state: ClassVar[State]  # state that it was learned in
+    starts: Array  # (R, d) starts of the demonstrations, metres
+    goal: Array  # (d,) common end of the demonstrations, metres
     fit_seconds: float
     warnings: tuple[str, ...] = ()
     reason: str = ""

@@ -19,6 +19,7 @@ import numpy as np
 
 from dt_viz.flows.augmented_systems import PhaseCurve
 from dt_viz.flows.fields import Array, Indices
+from dt_viz.learning.initial_guess import groups_of
 from dt_viz.learning.preparation import Motions, PreparationSettings
 from dt_viz.metrics import arc_length, interpolate, resample_by_arc_length
 
@@ -94,18 +95,12 @@ class AugmentedSettings:
 class StartProcess:
     """A Gaussian process over starts: the mean of what it was given, and how it changes with the start."""
 
-    mean: Array
-    """(d,) mean of the starts."""
-    spread: float
-    """RMS distance of the starts from their mean, or a larger one."""
-    known: Array
-    """(R, d) starts, less their mean, in spreads."""
-    coefficients: Array
-    """(R, …)."""
-    width: float
-    """Width of the kernel, in spreads."""
-    noise: float
-    """Variance of what it does not explain."""
+    mean: Array  # (d,) mean of the starts
+    spread: float  # RMS distance of the starts from their mean, or a larger one
+    known: Array  # (R, d) starts, less their mean, in spreads
+    coefficients: Array  # (R, …)
+    width: float  # width of the kernel, in spreads
+    noise: float  # variance of what it does not explain
     narrow: float | None
     """Width of the kernel of that noise, in spreads; None for noise of each start by itself."""
 
@@ -171,24 +166,17 @@ class Pattern:
 
     label: float | None
     """Label of the demonstrations; None where their starts tell them from others."""
-    mean: Array
-    """(K, d) mean demonstration at the knots, from the start, metres."""
+    mean: Array  # (K, d) mean demonstration at the knots, from the start, metres
     fading: Array
     """(K,) part of an offset of the start that is left at the knots, for starts near the mean one."""
-    reach: float
-    """Distance of a start from the mean one over which that part becomes u, metres."""
-    shapes: StartProcess
-    """(K, d) offsets from the mean and its fading shift."""
-    profile: Array
-    """(P,) mean part of the length that lies behind at even times."""
-    duration: float
-    """Mean logarithm of the duration of motions a metre long, seconds."""
-    timing: StartProcess
-    """(1 + P,) offsets from that logarithm, and from the profile."""
+    reach: float  # distance of a start from the mean one over which that part becomes u, metres
+    shapes: StartProcess  # (K, d) offsets from the mean and its fading shift
+    profile: Array  # (P,) mean part of the length that lies behind at even times
+    duration: float  # mean logarithm of the duration of motions a metre long, seconds
+    timing: StartProcess  # (1 + P,) offsets from that logarithm, and from the profile
     turn: Array | None = None
     """(K, 3) mean rotation vectors of the hand at the knots, times a radius, metres; None without orientations."""
-    turning: StartProcess | None = None
-    """(K, 3) offsets from them."""
+    turning: StartProcess | None = None  # (K, 3) offsets from them
 
     def points(self, start: Array) -> Array:
         """The predicted motion from a start (d,) at the knots, (K, d), metres."""
@@ -361,3 +349,39 @@ def _profile(times: Array, path: Array, num: int) -> Array:
     """The part of a motion's length that lies behind at `num` even times."""
     length = arc_length(path)
     return np.interp(np.linspace(0, times[-1], num), times, length / length[-1])
+
+
+def patterns_of(points: Array, num: int) -> Indices:
+    """Tell motions (R, n, d), evenly sampled along each, apart by their shapes, wherever they begin.
+
+    Returns the index (R,) of the pattern of each, `num` patterns at most, in the order in which they come first.
+    """
+    groups = groups_of(_without_start(points), num)
+    first = list(dict.fromkeys(groups))
+    return np.array([first.index(group) for group in groups])
+
+
+def set_apart(points: Array, of: Indices, least: float) -> bool:
+    """Whether motions (R, n, d) of different patterns (R,) differ `least` times as much as those of one pattern do.
+
+    See `AugmentedSettings.apart`. It plays no part where motions begin.
+    """
+    shapes = _without_start(points)
+    apart, same = np.linalg.norm(shapes[:, None] - shapes, axis=-1).mean(axis=-1), of[:, None] == of
+    return bool(apart[~same].min(initial=np.inf) >= least * apart[same].max())
+
+
+def _without_start(points: Array) -> Array:
+    """Motions (R, n, d) without an offset of their starts that fades."""
+    return points - np.linspace(1.0, 0.0, points.shape[1])[:, None] * points[:, :1]
+
+
+def told_by_starts(starts: Array, of: Indices, least: float) -> bool:
+    """Whether starts (R, d), metres, are nearest to one of their own pattern `of` (R,), if it has several.
+
+    Those of different patterns must be at least a distance `least` apart, metres.
+    """
+    apart = np.linalg.norm(starts[:, None] - starts, axis=-1) + np.diag(np.full(len(starts), np.inf))
+    several = np.bincount(of)[of] > 1
+    own = (of[apart.argmin(axis=1)] == of)[several]
+    return bool(own.all() and apart[of[:, None] != of].min(initial=np.inf) >= least)

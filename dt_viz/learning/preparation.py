@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from dt_viz.flows.rotations import apart, logarithm, mean_orientation
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.demonstrations import Demonstration, samples_of
 from dt_viz.learning.inspection import Inspection, PreparationSettings, Repaired, repair, smoothed_turns
+from dt_viz.memo import cached_property
 from dt_viz.metrics import arc_length, discrete_frechet, resample_by_arc_length
 from dt_viz.warning import in_metres, in_millimetres
 
@@ -44,14 +44,10 @@ class Motions:
     numbers: tuple[int, ...]
     """Numbers of the demonstrations that they are, from 0; others are left out."""
     names: tuple[str, ...]
-    times: tuple[Array, ...]
-    """(T_i,) times of each motion, seconds, increasing from 0."""
-    positions: tuple[Array, ...]
-    """(T_i, d) positions of each motion, the last row the goal."""
-    goal: Array
-    """(d,) common end."""
-    spread: float
-    """RMS distance of all points from their mean."""
+    times: tuple[Array, ...]  # (T_i,) times of each motion, seconds, increasing from 0
+    positions: tuple[Array, ...]  # (T_i, d) positions of each motion, the last row the goal
+    goal: Array  # (d,) common end
+    spread: float  # RMS distance of all points from their mean
     inspections: tuple[Inspection, ...]
     """What was found out about each demonstration, also about those that are left out."""
     repaired: tuple[Demonstration, ...]
@@ -249,7 +245,6 @@ def _given_goal(given: Sequence[float], ends: Array, reach: float) -> Array:
 
 
 def _no_common_goal(takes: Sequence[Repaired], ends: Array, reach: float) -> NoCommonGoalError:
-    """Say which takes end where, and how to choose."""
     left, groups = np.ones(len(ends), bool), []
     while left.any():
         around = (np.linalg.norm(ends[:, None] - ends, axis=-1) <= reach) & left

@@ -37,18 +37,15 @@ LearnPlain = Callable[[ImitationSettings, Progress], Imitation]
 class ChoiceSettings:
     """Settings of the choice between the states."""
 
-    fewest: int = 3
-    """Least number of demonstrations of which some are left out."""
-    folds: int = 5
-    """Largest number of folds in which that is done."""
+    fewest: int = 3  # least number of demonstrations of which some are left out
+    folds: int = 5  # largest number of folds in which that is done
     iterations: int = 5
     """Largest number of iterations of a plain fit to those of a fold; what is left out gains little by more."""
     alike: float = 1.05
     """Ratio of plain motions' distance from what was left out to augmented ones', up to which they are as good."""
     close: float = 0.005
     """The same distance, relative to the extent, up to which they are good however good augmented ones are."""
-    hopeless: float = 1.25
-    """The same ratio from which no more folds are asked."""
+    hopeless: float = 1.25  # the same ratio from which no more folds are asked
     part: float = 0.5
     """Part of the time that the folds take of all that is learned, for those who wait."""
 

@@ -19,8 +19,7 @@ from dt_viz.learning.state import learn
 FORMAT = 5
 """Version of the fit and its file; raised with every change, so that older files are not used."""
 
-MAX_BYTES = 40 * 10**6
-"""Largest number of bytes that a file unpacks to."""
+MAX_BYTES = 40 * 10**6  # largest number of bytes that a file unpacks to
 
 LONGEST_WRITE = 3600.0
 """Age after which an incomplete file counts as left behind by a server that has ended, seconds."""
@@ -39,8 +38,7 @@ class FitStore:
         self._folder = folder
         self._memory: dict[str, Imitation] = {}
         self._making: dict[str, threading.Lock] = {}
-        self._reports: dict[str, tuple[float, str]] = {}
-        """How far fits are that are being made."""
+        self._reports: dict[str, tuple[float, str]] = {}  # how far fits are that are being made
         if folder is not None:
             _remove_leftovers(folder)
 

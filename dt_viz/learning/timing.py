@@ -7,7 +7,6 @@ has learned of the demonstrations' shape is kept, and their timing is learned af
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
@@ -18,6 +17,7 @@ from dt_viz.flows.diffeomorphisms import Diffeomorphism
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.systems import Attractor, asinh_exp, log_sinh
 from dt_viz.learning.preparation import Motions
+from dt_viz.memo import cached_property
 from dt_viz.metrics import interpolate
 
 ARRIVED = 3e-4  # distance from the goal, relative to the ray's length, that counts as a demonstration's end
@@ -31,8 +31,7 @@ class TimingSettings:
     """Smallest pace: a motion is at most about seven times as fast as the plain attractor."""
     smoothness: float = 0.03
     """Weight of a pace's second differences against errors in time, relative to the duration."""
-    num_knots: int = 48
-    """Number of knots of each pace function."""
+    num_knots: int = 48  # number of knots of each pace function
     num_ray: int = 400
     """Number of points of a rollout that a demonstration's points may be matched with."""
     num_samples: int = 120
@@ -49,10 +48,8 @@ class TimedAttractor(Attractor):
     quadratic between knots, T(τ) = ∫m dτ, and is inverted in closed form.
     """
 
-    directions: Array
-    """(R, d) unit vectors from the goal to where the demonstrations start."""
-    knots: Array
-    """(K,) increasing and equally spaced values of τ, seconds."""
+    directions: Array  # (R, d) unit vectors from the goal to where the demonstrations start
+    knots: Array  # (K,) increasing and equally spaced values of τ, seconds
     paces: Array
     """(R, K) m_i at the knots, positive; all equal at the first knot, nearest the goal, so that ż is smooth there."""
     sharpness: float = 0.1

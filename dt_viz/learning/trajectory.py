@@ -23,15 +23,12 @@ class TrajectoryFit:
     """The least-squares problem: mean squared distance of rollouts to demonstrations + regularisation·‖θ‖²."""
 
     chain: FlowChain
-    targets: Array
-    """(R, n, d) points of the demonstrations, the last one the common goal."""
-    importance: Array
-    """(R,) weights of their squared distances, relative to their mean."""
+    targets: Array  # (R, n, d) points of the demonstrations, the last one the common goal
+    importance: Array  # (R,) weights of their squared distances, relative to their mean
     regularisation: float
     min_determinant: float
     """Smallest determinant of a step's derivative; coefficients with a smaller one are refused."""
-    end_weight: float = 20.0
-    """Weight of a residual at a ray's end against one between."""
+    end_weight: float = 20.0  # weight of a residual at a ray's end against one between
     along_weight: float = 0.3
     """Weight of a residual's component along the motion, where an error is one of timing only."""
 

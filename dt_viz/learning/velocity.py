@@ -22,12 +22,9 @@ class VelocityFit:
     """Mean of ‖ẋ_n − J(x_n)⁻¹·f(ψ(x_n))‖² + regularisation·tr WᵀKW, f the base attractor, as a function of W."""
 
     grid: GaussianGrid
-    positions: Array
-    """x_n, (N, d)."""
-    velocities: Array
-    """ẋ_n, (N, d)."""
-    goal: Array
-    """(d,); the base attractor's goal is its image."""
+    positions: Array  # x_n, (N, d)
+    velocities: Array  # ẋ_n, (N, d)
+    goal: Array  # (d,); the base attractor's goal is its image
     speed: float
     smoothing: float
     regularisation: float

@@ -23,14 +23,11 @@ from dt_viz.motion.following import MAX_TRACKING_ERROR, Follower
 from dt_viz.motion.solve import Solved, solve
 from dt_viz.motion.stack import FINE, LIVE
 from dt_viz.robot.inverse_kinematics import UnreachableError, best_start, inverse_kinematics, track
-from dt_viz.robot.joint_trajectory import JointTrajectory
+from dt_viz.robot.joint_trajectory import JointTrajectory, rest_to_rest, within_velocity_limits
 from dt_viz.robot.models import EndEffector, robot_from_urdf
 from dt_viz.robot.models import load_arm as load_robot
 from dt_viz.robot.placement import place
-from dt_viz.robot.rest_to_rest import rest_to_rest
-from dt_viz.robot.retiming import within_velocity_limits
-from dt_viz.robot.robot import Robot
-from dt_viz.robot.tracking_settings import TrackingSettings
+from dt_viz.robot.robot import Robot, TrackingSettings
 from dt_viz.warning import in_millimetres
 
 Frame = Literal["base", "page"]

@@ -8,8 +8,7 @@ from numpy.typing import ArrayLike
 from dt_viz.errors import FormatError
 from dt_viz.flows.fields import Array
 from dt_viz.library.motion import NUM_COORDINATES, Motion
-from dt_viz.library.orientations import angular_velocity
-from dt_viz.library.places import as_places
+from dt_viz.library.places import angular_velocity, as_places
 
 PUSHED = 0.05
 """Distance from where the hand should be, relative to half the demonstrations' extent, from which it was pushed."""

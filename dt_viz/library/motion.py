@@ -10,10 +10,11 @@ Everything is computed by what the page is computed by; `import dt_viz` offers t
 from __future__ import annotations
 
 import os
+import pathlib
 import warnings
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,32 +26,91 @@ from dt_viz.errors import FormatError, check_between
 from dt_viz.flows.augmented_systems import frozen
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.rollouts import Rays, evenly_sampled, refined
+from dt_viz.folders import default_cache_folder
 from dt_viz.learning.augmented import unknown_label
+from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.imitation import ImitationSettings, Objective
 from dt_viz.learning.inspection import Inspection
+from dt_viz.learning.interface import AnyImitation
 from dt_viz.learning.patterns import AugmentedSettings
 from dt_viz.learning.preparation import DemonstrationWarning, prepare
 from dt_viz.learning.state import State, learn
-from dt_viz.library.opened import learned_for
-from dt_viz.library.orientations import along
-from dt_viz.library.places import as_place, as_places, in_space
-from dt_viz.library.report import many, missed, orientation_line, sampled, summaries
+from dt_viz.learning.store import FitStore
+from dt_viz.library.places import along, as_place, as_places, in_space
 from dt_viz.library.takes import Demonstrations, check_goals, demonstrations_of
+from dt_viz.memo import cached_property
+from dt_viz.metrics import arc_length, discrete_frechet, resample_by_arc_length
 from dt_viz.motion.certificates import Certificates, DrawnSamples, certified
 from dt_viz.motion.diagnostics import motion_warnings
-from dt_viz.motion.nominal import NUM_SAMPLES, Learned, Nominal
+from dt_viz.motion.nominal import NUM_SAMPLES, Learned, Nominal, augmented_of, learned_of, styled
 from dt_viz.motion.solve import Solved, solve, warped
 from dt_viz.motion.stack import FINE, Solution
 from dt_viz.saving import SavedMotion, load_motion, save_motion, save_scenario
-from dt_viz.scenario.saved import Saved
+from dt_viz.scenario.saved import Saved, ScenarioError, check_shapes
 from dt_viz.scenario.scenario import Layer, Scenario
-from dt_viz.scenario.tasks import Task
-from dt_viz.warning import in_metres
+from dt_viz.scenario.tasks import OWN, STYLES, TASKS, Task
+from dt_viz.warning import in_metres, in_millimetres
 
-NUM_COORDINATES = 3
-"""Coordinates of motions in space."""
-ALONE = Scenario("", ())
-"""What was learned, with nothing stacked on it."""
+
+def many(num: int, what: str) -> str:
+    """A number of things, such as "1 take" or "2 takes"."""
+    return f"{num} {what}{'' if num == 1 else 's'}"
+
+
+def sampled(positions: Array, times: Array) -> str:
+    """Samples of a motion: their number, its length and duration."""
+    return f"{len(times)} samples, {arc_length(positions)[-1]:.3g} m in {times[-1]:.3g} s"
+
+
+def summaries(inspections: Sequence[Inspection]) -> list[str]:
+    """One sentence for each kind of finding and remedy, about its first take and the number of others."""
+    alike: dict[tuple[str, str], list[str]] = defaultdict(list)
+    for inspection in inspections:
+        for found, text in zip(inspection.findings, inspection.warnings, strict=True):
+            alike[found.kind, found.remedy].append(text)
+    more = "{} (and {} alike; see Motion.report())"
+    return [more.format(first, many(len(rest), "more take")) if rest else first for first, *rest in alike.values()]
+
+
+def orientation_line(imitation: AnyImitation, demonstrations: Sequence[Demonstration]) -> str:
+    """What became of the orientations of demonstrations; empty where these have none."""
+    without = [one.name for one in demonstrations if one.orientations is None]
+    if imitation.has_orientation or len(without) == len(demonstrations):
+        return ""
+    why = "in the plain state" if imitation.state == "plain" else "of motions in the plane"
+    return f"the hand's orientation is not learned {why if not without else f': {without[0]!r} has none'}"
+
+
+def missed(path: Array, demonstration: Array) -> str:
+    """Discrete Fréchet distance of a learned motion (T, d) from its demonstration (S, d)."""
+    off = discrete_frechet(resample_by_arc_length(path, 200), resample_by_arc_length(demonstration, 200))
+    return in_millimetres(float(off))
+
+
+def learned_for(saved: Saved, source: str | pathlib.Path) -> Learned:
+    """Learn what a scenario is stacked on; `source` is its file's name, for messages.
+
+    Raises:
+        ScenarioError: an obstacle is no solid, or the page has placed the task anew for the arm.
+        ImitationError: nothing can be learned from the demonstrations.
+    """
+    scenario = saved.scenario
+    check_shapes(scenario, str(source))
+    if saved.own is None and scenario.arm:
+        found = f"{scenario.arm!r}, in whose reach the page has placed {scenario.task!r}"
+        raise ScenarioError(source, "arm", found, "the first one of a page, or demonstrations of your own")
+
+    def task(name: str) -> Task:
+        return saved.own.task if saved.own is not None and name == OWN else TASKS[name]()
+
+    if scenario.style and scenario.imitation:
+        own, usual, other = (augmented_of(task(name)) for name in (scenario.task, *STYLES[scenario.style]))
+        return styled(task(scenario.task), own, usual, other, scenario.style_amount)
+    return learned_of(scenario, task(scenario.task), FitStore(default_cache_folder()))
+
+
+NUM_COORDINATES = 3  # coordinates of motions in space
+ALONE = Scenario("", ())  # what was learned, with nothing stacked on it
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,15 +7,19 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from dt_viz.avoidance.avoidance import Avoidance
 from dt_viz.avoidance.transform import Anchored, Planar, Transform
 from dt_viz.errors import FormatError
 from dt_viz.flows.fields import Array
+from dt_viz.flows.rollouts import Bundle, Rays
+from dt_viz.flows.rotations import turning
+from dt_viz.learning.augmented import AugmentedImitation
+from dt_viz.learning.demonstrations import checked_orientations
 from dt_viz.obstacles.shapes import Obstacle, Point
 
-PLANE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
-"""The plane of motions with two coordinates."""
+PLANE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))  # the plane of motions with two coordinates
 
 
 def in_space(transform: Transform, dimension: int) -> Transform:
@@ -70,3 +74,49 @@ def _point(owner: Anchored | Obstacle, dimension: int) -> Point:
         dimension = 3  # a place before or behind the plane
     x, y, z = (*as_place(position, dimension, f"position of {type(owner).__name__}"), 0.0)[:3]
     return x, y, z
+
+
+NOT_LEARNED = "none: no orientations were learned"
+
+
+def along(
+    poses: AugmentedImitation | None, rays: Rays, bundle: Bundle, begin: ArrayLike | None
+) -> tuple[Array, ...] | tuple[None, ...]:
+    """Orientations (T_i, 4), wxyz, of each of a bundle of motions; None where none were learned.
+
+    They begin with those that are given, (R, 4), or (4,) for all; None begins as they were learned.
+
+    Raises:
+        FormatError: `begin` is no orientations, or none were learned.
+    """
+    if poses is None:
+        if begin is not None:
+            raise FormatError("orientations", "some", NOT_LEARNED)
+        return (None,) * len(rays.z0)
+    system, rest = poses.system, rays.z0[:, 3:]
+    states = np.hstack([np.zeros((len(rest), poses.dim)), rest])  # on the motions that were learned
+    if begin is not None:
+        given = np.asarray(begin)
+        given = checked_orientations(np.tile(given, (len(rest), 1)) if given.ndim == 1 else given, len(rest))
+        start = system.transform.inverse(states)
+        start[:, 3:6] = poses.turns(given, start[:, 3:6])
+        states = system.transform.forward(start)
+    z = system.base.at_fraction(states[bundle.index], (1 - bundle.fraction)[:, None])[:, 0]
+    return bundle.split(poses.orientations(system.transform.inverse(z)[:, 3:6]))
+
+
+def angular_velocity(poses: AugmentedImitation | None, rest: Array, orientation: ArrayLike, dt: float) -> Array:
+    """ω (3,), rad/s, in the base frame, that takes a hand, of which the orientation (4,) is given, on with its motion.
+
+    That is to the orientation `dt` seconds later than at a phase and for a condition, `rest` (1 + c,).
+
+    Raises:
+        FormatError: the orientation is none, or none were learned.
+    """
+    if poses is None:
+        raise FormatError("orientation", "one", NOT_LEARNED)
+    now, system = checked_orientations(np.asarray(orientation)[None], 1), poses.system
+    learned = system.transform.inverse(np.concatenate([np.zeros(poses.dim), rest]))
+    state = np.concatenate([learned[:3], poses.turns(now, learned[None, 3:6])[0], rest])
+    reached = poses.orientations(system.rollout(state, np.array([dt]))[0, 3:6])
+    return turning(now[0], reached) / dt

@@ -33,10 +33,8 @@ Demonstrations: TypeAlias = (
     "Demonstration | ArrayLike | str | os.PathLike[str] | Mapping[str, Any] | Iterable[Any]"  # or a pandas.DataFrame
 )
 """What `fit` learns from; see there."""
-DURATION = 5.0
-"""Duration of a take without times, seconds, as in files."""
-UNTIMED = np.empty(0)
-"""Times of a take without times, until it is known whether all have some."""
+DURATION = 5.0  # duration of a take without times, seconds, as in files
+UNTIMED = np.empty(0)  # times of a take without times, until it is known whether all have some
 ACCEPTED = "arrays (T, 2) or (T, 3), metres, such as dt.fit([positions, …], rate=100)"
 
 
@@ -82,7 +80,6 @@ def demonstrations_of(given: Any, rate: float | None = None) -> tuple[Demonstrat
 
 
 def _complete(take: Demonstration, number: int) -> Demonstration:
-    """A take with times and a name."""
     times = np.linspace(0.0, DURATION, len(take.positions)) if take.times is UNTIMED else take.times
     return replace(take, times=times, name=take.name or f"take {number}")
 
@@ -151,7 +148,6 @@ def _of_array(given: Any, rate: float | None) -> Iterator[Demonstration]:  # noq
 
 
 def _way_out(array: Array) -> str:
-    """What may be meant by an array that is no positions."""
     if array.ndim == 2 and array.shape[0] in DIMENSIONS:
         return "; if each row is a coordinate: positions.T"
     if array.ndim in (2, 3) and array.shape[-1] == 4:

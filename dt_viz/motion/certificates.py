@@ -9,7 +9,6 @@ of another motion, and those that are permuted, shifted or mistimed.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from dt_viz.flows.diffeomorphisms import Conjugated, Diffeomorphism, Flow
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.rollouts import ARRIVED
 from dt_viz.flows.rotations import apart
+from dt_viz.memo import cached_property
 from dt_viz.motion.stack import Solution
 from dt_viz.robot.collision import CollisionReport
 from dt_viz.robot.robot import Robot
@@ -107,16 +107,11 @@ class Certificates:
 class DrawnSamples:
     """Motions of the end effector as they are shown, one after the other, and what is said of each sample."""
 
-    index: Indices
-    """(N,) which rollout a sample belongs to, not decreasing."""
-    fraction: Array
-    """(N,) where on its base ray it is said to be."""
-    times: Array
-    """(N,) when it is said to be there, seconds."""
-    positions: Array
-    """(N, 3), metres."""
-    num: int
-    """R, the number of rollouts; those that are not shown have no samples."""
+    index: Indices  # (N,) which rollout a sample belongs to, not decreasing
+    fraction: Array  # (N,) place of each sample on its base ray
+    times: Array  # (N,) time of each sample, seconds
+    positions: Array  # (N, 3), metres
+    num: int  # R, the number of rollouts; those that are not shown have no samples
 
     def split(self, values: Array) -> tuple[Array, ...]:
         """Cut an array (N, …) that belongs to the samples into one array for each rollout."""

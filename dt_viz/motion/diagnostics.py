@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from dt_viz.avoidance.arm_solver import MARGIN_TOLERANCE
-from dt_viz.avoidance.start_status import StartStatus, start_warnings
+from dt_viz.avoidance.avoidance import StartStatus, start_warnings
 from dt_viz.avoidance.transform import Anchored, MotionBelow
 from dt_viz.flows.diffeomorphisms import Chain, Conjugated, Diffeomorphism, Flow, Integration
 from dt_viz.flows.fields import Array
@@ -23,8 +23,7 @@ from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import WHOLE_ARM
 from dt_viz.warning import ARM, Kind, MotionWarning, in_millimetres
 
-MAX_GOAL_MISS = 1e-3
-"""Distance beside the goal at which motions may end before it is said, metres."""
+MAX_GOAL_MISS = 1e-3  # distance from the goal beyond which the end of a motion has a warning, metres
 NUM_CHECKED_LIVE = 300
 """Number of samples on which it is computed what an integrator costs that was chosen by hand."""
 
@@ -141,7 +140,6 @@ def _of_integration(solved: Solved, robot: Robot | None) -> tuple[MotionWarning,
 
 
 def _moves_goal(nominal: Nominal, stack: Solution) -> bool:
-    """Whether some transform means to end motions elsewhere."""
     goals = [nominal.goal, *(applied.made.goal for applied in stack.built)]
     moves = (bool(np.any(a != b)) for a, b in pairwise(goals))
     return any(m and not applied.transform.avoided.parts for m, applied in zip(moves, stack.built, strict=True))

@@ -8,11 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dt_viz.avoidance.arm import WholeArm
-from dt_viz.avoidance.avoidance import ArmAvoidance
-from dt_viz.avoidance.lift import NUM_CONFIGURATIONS, Lift, lift
+from dt_viz.avoidance.avoidance import ArmAvoidance, StartStatus, start_warnings
+from dt_viz.avoidance.lift import NUM_CONFIGURATIONS, Lift, ReferencePostures, lift, reference_postures
 from dt_viz.avoidance.passing import Posture
-from dt_viz.avoidance.postures import ReferencePostures, reference_postures
-from dt_viz.avoidance.start_status import StartStatus, start_warnings
 from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.flows.rotations import mean_orientation
 from dt_viz.memo import Memo
@@ -35,18 +33,14 @@ from dt_viz.warning import ARM, Kind, MotionWarning
 
 BY_FRACTION = 0.3
 """Part of the even spacing of postures that goes by the fraction of the base ray, not by the length of the path."""
-MAX_TRACKING_ERROR = 1e-3
-"""Distance by which the hand may miss its path before it is said, metres."""
+MAX_TRACKING_ERROR = 1e-3  # distance from its path beyond which the hand has a warning, metres
 MAX_TURNED = 10.0
 """Angle by which the hand may be turned beside its orientation before it is said, degrees."""
 NUM_ARM_SAMPLES = 200
 """Samples of the motion that the arm shows where it follows a path of the end effector."""
-NUM_ON_PATH = 20
-"""Samples of the mean motion that reference postures are tried on."""
-NUM_POSTURES = 64
-"""Number of reference_postures, over all tasks, whose joints are kept."""
-NEWEST = 2 * MAX_STARTS
-"""Number of added starts whose joints are kept."""
+NUM_ON_PATH = 20  # samples of the mean motion that reference postures are tried on
+NUM_POSTURES = 64  # number of reference_postures, over all tasks, whose joints are kept
+NEWEST = 2 * MAX_STARTS  # number of added starts whose joints are kept
 
 
 @dataclass(frozen=True)
@@ -55,10 +49,8 @@ class ArmMotion:
 
     times: Array
     """(T,) seconds, later than the rollout's where the joints' velocity limits ask for it."""
-    q: Array
-    """(T, n) joint angles at these times, rad; continuous joints unwrapped."""
-    without: Array
-    """(T, n) the same at the same moments of the motion without avoidance."""
+    q: Array  # (T, n) joint angles at these times, rad; continuous joints unwrapped
+    without: Array  # (T, n) the same at the same moments of the motion without avoidance
     orientations: Array | None = None
     """(T, 4) orientations that the hand is to have there, wxyz; None where none were learned."""
 
@@ -67,10 +59,8 @@ class ArmMotion:
 class Admission:
     """Whether and from where the whole arm can move."""
 
-    nominal: Nominal
-    """The rollouts that it can begin."""
-    blocked: tuple[MotionWarning, ...] = ()
-    """Why it cannot move at all; empty where it can."""
+    nominal: Nominal  # the rollouts that it can begin
+    blocked: tuple[MotionWarning, ...] = ()  # why it cannot move at all; empty where it can
 
 
 class Follower:

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
+from dt_viz.avoidance.avoidance import StartStatus, start_warnings
 from dt_viz.avoidance.lift import NUM_CONFIGURATIONS
 from dt_viz.avoidance.passing import Posture
-from dt_viz.avoidance.start_status import StartStatus, start_warnings
 from dt_viz.flows.diffeomorphisms import Identity
 from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.flows.rollouts import Bundle, Rays, evenly_sampled
 from dt_viz.flows.systems import DiffeomorphicSystem
-from dt_viz.learning.augmented import AugmentedImitation
+from dt_viz.learning.augmented import AugmentedImitation, Style, fit_augmented
+from dt_viz.learning.imitation import ImitationSettings, Progress
 from dt_viz.learning.interface import AnyImitation
-from dt_viz.scenario.scenario import Start
-from dt_viz.scenario.tasks import Task
+from dt_viz.learning.patterns import AugmentedSettings
+from dt_viz.learning.store import FitStore
+from dt_viz.memo import cached_property
+from dt_viz.scenario.scenario import Scenario, Start
+from dt_viz.scenario.tasks import OWN, Task
 from dt_viz.warning import MotionWarning
 
 NUM_SAMPLES = 200
@@ -29,14 +32,10 @@ NUM_SAMPLES = 200
 class NominalTrajectory:
     """One undisturbed rollout."""
 
-    start: Array
-    """(3,), metres."""
-    image: Array
-    """ψ of the state in which it begins, (k,)."""
-    fraction: Array
-    """(n,) where on its base ray the samples are."""
-    positions: Array
-    """(n, 3) samples, metres."""
+    start: Array  # (3,), metres
+    image: Array  # ψ of the state in which it begins, (k,)
+    fraction: Array  # (n,) where on its base ray the samples are
+    positions: Array  # (n, 3) samples, metres
     orientations: Array | None = None
     """(n, 4) orientations of the hand there, wxyz; None where none were learned."""
 
@@ -49,8 +48,7 @@ class Learned:
     imitation: AnyImitation
     system: DiffeomorphicSystem
     """The system of its states: places (3,) in the plain state; see `flows.augmented_systems` for the augmented one."""
-    goal: Array
-    """(3,), metres."""
+    goal: Array  # (3,), metres
 
     @classmethod
     def of(cls, task: Task, imitation: AnyImitation, *, imitates: bool) -> Learned:
@@ -118,12 +116,9 @@ class Nominal:
     """
 
     learned: Learned
-    trajectories: tuple[NominalTrajectory, ...]
-    """(R) the rollouts."""
-    status: tuple[StartStatus, ...]
-    """(R) whether each start has a motion, or why it has none."""
-    posture: Posture | None = None
-    """Posture that the arm stays near to; None is its usual one."""
+    trajectories: tuple[NominalTrajectory, ...]  # (R) the rollouts
+    status: tuple[StartStatus, ...]  # (R) whether each start has a motion, or why it has none
+    posture: Posture | None = None  # posture that the arm stays near to; None is its usual one
 
     @property
     def task(self) -> Task:
@@ -246,3 +241,33 @@ class Nominal:
         rest = np.concatenate([self.rays.z0[:, 3:], [self.system.base.goal[3:]]])
         *z0, z_e = self.system.transform.forward(np.concatenate([ends, rest], axis=1))
         return Rays(np.stack(z0), replace(self.system.base, goal=z_e))
+
+
+def learned_of(scenario: Scenario, task: Task, fits: FitStore, progress: Progress | None = None) -> Learned:
+    """Learn the scenario's task without a style.
+
+    Raises:
+        ImitationError: nothing can be learned from its demonstrations.
+    """
+    state = task.state if scenario.state == "auto" else scenario.state
+    state = state if scenario.imitation else "plain"  # without it there is nothing to remember
+    settings, imitation = ImitationSettings(scenario.objective, preparation=task.preparation), task.imitation
+    if imitation is None or imitation.state != state or scenario.objective != "trajectory":
+        imitation = fits.learned(task.demonstrations, settings, state, progress)
+    if imitation.state == "augmented" and scenario.state == "auto" and not imitation.reason:
+        own = task.name.startswith(OWN)
+        why = "it is learned at once" if own else "the plain state misses a demonstration of this task"
+        imitation = replace(imitation, reason=why)
+    return Learned.of(task, imitation, imitates=scenario.imitation)
+
+
+def augmented_of(task: Task) -> AugmentedImitation:
+    """Learn a task in the augmented state, to take or put on a style. Raises ImitationError."""
+    return fit_augmented(task.demonstrations, settings=AugmentedSettings(preparation=task.preparation))
+
+
+def styled(
+    task: Task, own: AugmentedImitation, usual: AugmentedImitation, other: AugmentedImitation, amount: float
+) -> Learned:
+    """Put a part of what leads from the usual hand to the other one on what was learned of a task."""
+    return Learned.of(task, Style.between(usual, other).on(own, amount), imitates=True)

@@ -18,22 +18,18 @@ from dt_viz.motion.certificates import DrawnSamples
 from dt_viz.motion.following import Follower
 from dt_viz.motion.solve import Solved
 
-NUM_SAMPLES = 120
-"""Number of samples at even distances along a path, start and goal included."""
+NUM_SAMPLES = 120  # number of samples at even distances along a path, start and goal included
 
 
 @dataclass(frozen=True)
 class Profile:
     """One motion along its normalised path, at N even distances from start (0) to goal (1)."""
 
-    lyapunov: Array
-    """(N,) Φ(ψ(y)) over its value at the start."""
-    distance: Array
-    """(N,) of the end effector from the nearest point of its demonstration, metres."""
+    lyapunov: Array  # (N,) Φ(ψ(y)) over its value at the start
+    distance: Array  # (N,) of the end effector from the nearest point of its demonstration, metres
     clearance: Array
     """(N,) distance from the obstacles of what avoids them, metres, negative inside; infinite where there are none."""
-    frechet: float
-    """Discrete Fréchet distance of the end effector to its demonstration, metres."""
+    frechet: float  # discrete Fréchet distance of the end effector to its demonstration, metres
     depth: float
     """How deep what avoids the obstacles enters them (M.C.D.), metres; 0 when it is clear."""
 

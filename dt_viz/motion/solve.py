@@ -8,9 +8,9 @@ from itertools import islice
 import numpy as np
 
 from dt_viz.avoidance.arm_solver import ArmSolution
+from dt_viz.avoidance.avoidance import StartStatus
 from dt_viz.avoidance.lift import Lift
 from dt_viz.avoidance.passing import ANEW, Passing
-from dt_viz.avoidance.start_status import StartStatus
 from dt_viz.flows.fields import Array
 from dt_viz.motion.following import Follower
 from dt_viz.motion.nominal import Nominal
@@ -26,16 +26,11 @@ NUM_ALTERNATIVES = 3
 class Solved:
     """A scenario's motion: the end effector's stack, and how the whole arm avoids on top of it."""
 
-    scenario: Scenario
-    """It, or one that moves like it."""
-    nominal: Nominal
-    """The undisturbed motion."""
-    below: Nominal
-    """The same, warped as far as the stack is that is built on it."""
-    stack: Solution
-    """Stack of the end effector, before the whole arm avoids anything."""
-    arm: ArmSolution | None = None
-    """None where only the end effector avoids."""
+    scenario: Scenario  # it, or one that moves like it
+    nominal: Nominal  # the undisturbed motion
+    below: Nominal  # the same, warped as far as the stack is that is built on it
+    stack: Solution  # stack of the end effector, before the whole arm avoids anything
+    arm: ArmSolution | None = None  # None where only the end effector avoids
     lifted: Lift | None = None
     """Joints along the stack's motion, which the arm's avoidance is made for; None where there is none."""
     blocked: tuple[MotionWarning, ...] = ()

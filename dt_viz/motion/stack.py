@@ -20,18 +20,15 @@ from dt_viz.obstacles.shapes import Point
 from dt_viz.scenario.scenario import Layer
 from dt_viz.warning import MotionWarning
 
-MAX_ATTEMPTS = 4
-"""Attempts at a flow time that also clears the samples that refinement adds."""
+MAX_ATTEMPTS = 4  # attempts at a flow time that also clears the samples that refinement adds
 
 
 @dataclass(frozen=True)
 class Precision:
     """How exactly a motion is worked out, all in metres."""
 
-    tolerance: float
-    """Tolerance of a step of the transforms' flows."""
-    spacing: float
-    """Largest distance between neighbouring samples."""
+    tolerance: float  # tolerance of a step of the transforms' flows
+    spacing: float  # largest distance between neighbouring samples
     ends: float
     """Distance by which a rollout may miss its start and goal before the motion below is made anew."""
 
@@ -45,13 +42,11 @@ FINE = Precision(tolerance=2e-9, spacing=0.005, ends=1e-7)
 class Applied:
     """A layer of a stack as it was made."""
 
-    place: int
-    """Place of the layer in the whole stack, in which some may be off."""
+    place: int  # place of the layer in the whole stack, in which some may be off
     name: str
     transform: Transform
     made: Built
-    satisfied: bool
-    """Whether it finds in the motion what it was made for."""
+    satisfied: bool  # whether it finds in the motion what it was made for
 
     @property
     def may_improve(self) -> bool:
@@ -66,8 +61,7 @@ class Solution:
     transform: Diffeomorphism
     rays: Rays
     bundle: Bundle
-    built: tuple[Applied, ...]
-    """The layers that are on, from the inside out."""
+    built: tuple[Applied, ...]  # the layers that are on, from the inside out
 
     @property
     def system(self) -> DiffeomorphicSystem:
@@ -181,8 +175,7 @@ def warped_stack(nominal: Nominal, full: Solution, fraction: float, precision: P
 class _Motions:
     """Rollouts on all levels of a stack."""
 
-    ends: Array
-    """(R + 1, 3) places below the stack that the rays begin and end at, metres."""
+    ends: Array  # (R + 1, 3) places below the stack that the rays begin and end at, metres
     rays: Rays
     bundle: Bundle
 

@@ -16,16 +16,14 @@ from dt_viz.flows.fields import Array, Indices
 from dt_viz.obstacles.occupancy import fit_occupancy
 from dt_viz.obstacles.solids import ByContent, Solid
 
-MIN_POINTS, MAX_POINTS = 50, 100_000
-"""Smallest and largest number of points of a cloud."""
+MIN_POINTS, MAX_POINTS = 50, 100_000  # smallest and largest number of points of a cloud
 
 
 @dataclass(frozen=True)
 class CloudSettings:
     """How the space that a cloud occupies is found."""
 
-    num_nodes: int = 44**3
-    """Approximate number of nodes of the grid on which the surface is found."""
+    num_nodes: int = 44**3  # approximate number of nodes of the grid on which the surface is found
     reach: float = 1.2
     """Radius of the occupied ball around an unlabelled point, in units of the ninth decile of the distance from the
     sixth nearest point: random points on a surface then leave no hole."""
@@ -33,10 +31,8 @@ class CloudSettings:
     """Smallest such radius in cells of the grid: thinner walls would have holes."""
     kernels_across: float = 5
     """Number of kernel widths along the largest side of the occupied points, where they are labelled."""
-    num_samples: int = 2000
-    """Largest number of labelled points that the map is learned from."""
-    regularisation: float = 0.1
-    """Weight of ½‖w‖² of that map."""
+    num_samples: int = 2000  # largest number of labelled points that the map is learned from
+    regularisation: float = 0.1  # weight of ½‖w‖² of that map
 
 
 SETTINGS = CloudSettings()
@@ -70,10 +66,8 @@ class Cloud(ByContent):
         FormatError: they are too few or too many, or, without labels, the same; or not finite, or wrongly labelled.
     """
 
-    points: Array
-    """(K, 3) metres, in the cloud's own frame."""
-    labels: Array | None = None
-    """(K,) 1 occupied and 0 free; None where all are occupied."""
+    points: Array  # (K, 3) metres, in the cloud's own frame
+    labels: Array | None = None  # (K,) 1 occupied and 0 free; None where all are occupied
 
     def __post_init__(self) -> None:
         self._keep(points=float, labels=float)

@@ -1,7 +1,7 @@
 """Obstacles' shapes from files of closed meshes and point clouds; see the table in `dt_viz/files/README.md`.
 
 The origin of a shape is moved to the middle of its bounding box. Files are read by a process of their own
-(`dt_viz.files.uploads`).
+(`dt_viz.files.reading`).
 """
 
 from __future__ import annotations
@@ -16,25 +16,23 @@ import numpy as np
 
 from dt_viz.errors import Cancelled, DataError, FormatError, never, parsing
 from dt_viz.files.checks import check_triangles, checked_suffix
+from dt_viz.files.reading import read_upload
 from dt_viz.files.shapes import Points, Triangles
 from dt_viz.files.triangles import Distances
-from dt_viz.files.uploads import read_upload
 from dt_viz.flows.fields import Array
 from dt_viz.obstacles.clouds import MAX_POINTS, Cloud, check_points
+from dt_viz.obstacles.shapes import SIZE
 from dt_viz.obstacles.solids import MEASURE, Solid
 
-MAX_BYTES = 20 * 10**6
-"""Largest number of bytes of a file."""
-MIN_SIZE, MAX_SIZE = 0.01, 1.0
-"""Smallest and largest length of the bounding box's longest side, metres."""
+MAX_BYTES = 20 * 10**6  # largest number of bytes of a file
+MIN_SIZE, MAX_SIZE = SIZE
 UNITS = {"metres": 1.0, "millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254}
 """Units of files, in metres; the first that gives a sensible size is suggested."""
 LOST = 0.8
 """Part of a mesh's volume inside the distance grid below which its thin parts are reported as lost."""
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb", ".gltf", ".off", ".3mf")
 CLOUD_SUFFIXES = (".ply", ".npz", ".csv")
-MAX_HEADER = 10_000
-"""Number of bytes in which the header of a PLY file ends."""
+MAX_HEADER = 10_000  # number of bytes in which the header of a PLY file ends
 
 
 class ShapeError(DataError):

@@ -9,9 +9,8 @@ import numpy as np
 from dt_viz.flows.fields import Array, Sum
 from dt_viz.numerics import unit
 from dt_viz.obstacles.occupancy import Generator
-from dt_viz.obstacles.shapes import Obstacle, nearest
+from dt_viz.obstacles.shapes import Obstacle, golden_spiral, nearest
 from dt_viz.obstacles.solids import with_slopes
-from dt_viz.obstacles.surfaces import golden_spiral
 
 MAX_STEPS, SHORTEST = 100, 1e-4
 """Largest number of steps along a line, and the smallest one, metres: bounds the overshoot beyond the surface."""

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dt_viz.checkpoints import checkpoint
 from dt_viz.errors import FormatError
-from dt_viz.flows.fields import Array
+from dt_viz.flows.fields import Array, Mask
+from dt_viz.scheduler import checkpoint
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -36,8 +36,7 @@ class FigurePanel:
     """Motions of one shape."""
 
     title: str
-    paths: Mapping[str, Sequence[Array]]
-    """(T_i, d) of each kind of `STYLES`, in any unit."""
+    paths: Mapping[str, Sequence[Array]]  # (T_i, d) of each kind of `STYLES`, in any unit
 
 
 def panels(shapes: Sequence[FigurePanel], columns: int = 6) -> Figure:
@@ -147,34 +146,26 @@ def widest_directions(points: Array) -> Array:
 class Strokes:
     """Lines of one kind."""
 
-    label: str
-    """Name in the legend."""
-    paths: Sequence[Array]
-    """(T_i, 2), metres."""
+    label: str  # name in the legend
+    paths: Sequence[Array]  # (T_i, 2), metres
     colour: str
-    width: float
-    """Width of the lines, metres, as on the page."""
-    dashed: bool = False
-    heads: bool = False
-    """Whether an arrow head in the middle of each line shows its direction."""
-    starts: bool = False
-    """Whether a dot marks where each line begins."""
+    width: float  # width of the lines, metres, as on the page
+    dashed: bool
+    heads: bool  # whether an arrow head in the middle of each line shows its direction
+    starts: bool  # whether a dot marks where each line begins
+    hidden: Sequence[Mask]  # which (T_i,) of the places of each path lie behind, or in, a body
 
 
 @dataclass(frozen=True)
 class Levels:
     """Level lines of a function, with their values written on them; or, where it is a body, its outline."""
 
-    label: str
-    """Name in the legend."""
-    values: Array
-    """(n, m) to the right and up, from corner to corner; NaN where unknown."""
+    label: str  # name in the legend
+    values: Array  # (n, m) to the right and up, from corner to corner; NaN where unknown
     levels: Sequence[float]
     colour: str
-    lower: Array
-    """(2,) lower left corner, metres."""
-    upper: Array
-    """(2,) upper right corner, metres."""
+    lower: Array  # (2,) lower left corner, metres
+    upper: Array  # (2,) upper right corner, metres
     is_body: bool = False
 
 
@@ -182,13 +173,10 @@ class Levels:
 class Arrows:
     """A vector field."""
 
-    places: Array
-    """(N, 2), metres."""
-    vectors: Array
-    """(N, 2) of any unit."""
+    places: Array  # (N, 2), metres
+    vectors: Array  # (N, 2) of any unit
     colour: str
-    length: float
-    """Length of the longest arrow, metres."""
+    length: float  # length of the longest arrow, metres
 
 
 @dataclass(frozen=True)
@@ -196,39 +184,27 @@ class Drawing:
     """A scene as it is seen in a plane; all places in metres."""
 
     title: str
-    lower: Array
-    """(2,) lower left corner."""
-    upper: Array
-    """(2,) upper right corner."""
-    strokes: Sequence[Strokes]
-    """Lines, the lowest first."""
+    lower: Array  # (2,) lower left corner
+    upper: Array  # (2,) upper right corner
+    strokes: Sequence[Strokes]  # lines, the lowest first
     levels: Sequence[Levels]
     arrows: Arrows
     points: Mapping[str, tuple[Array, str]]
     """(N, 2) places and their colour, by their name in the legend."""
 
 
-@dataclass(frozen=True)
-class PrintSettings:
-    """Sizes on paper of `scene_figure`."""
-
-    column: float = 3.4
-    """Width of a paper's column, inches: that of a figure with one panel; two and more share `page`."""
-    page: float = 7.0
-    """Width of both columns, inches."""
-    most_columns: int = 3
-    """Largest number of panels beside each other."""
-    tallest: float = 1.15
-    """Largest height of a panel, relative to its width."""
-    type_size: float = 8.0
-    """Size of type, points; values on lines are smaller."""
-    thinnest: float = 0.4
-    """Width of the thinnest lines, points."""
-    bar: float = 0.1
-    """Length of the scale bar, metres."""
+COLUMN, PAGE = 3.4, 7.0
+"""Widths of a paper's column, of a figure with one panel, and of both columns, which several panels share; inches."""
+MOST_COLUMNS = 3  # largest number of panels beside each other
+TALLEST = 1.15  # largest height of a panel, relative to its width
+TYPE = 8.0  # size of type, points; values on lines are smaller
+THINNEST = 0.4  # width of the thinnest lines, points
+BAR = 0.1  # length of the scale bar, metres
+PROJECTION, HIDDEN = "projection", "dotted where hidden by an obstacle"
+"""Notes below a figure, the second one where an obstacle hides a line, or has it inside."""
 
 
-def scene_figure(drawings: Sequence[Drawing], settings: PrintSettings | None = None) -> Figure:
+def scene_figure(drawings: Sequence[Drawing]) -> Figure:
     """Draw scenes side by side as wide as a paper's column, or as its page, with a scale bar and a legend.
 
     Raises:
@@ -237,13 +213,12 @@ def scene_figure(drawings: Sequence[Drawing], settings: PrintSettings | None = N
     check_installed()
     from matplotlib.figure import Figure  # noqa: PLC0415 - an extra
 
-    size = settings or PrintSettings()
-    columns = len(drawings) if len(drawings) <= size.most_columns else min(size.most_columns, ceil(len(drawings) / 2))
-    rows, whole = ceil(len(drawings) / columns), size.column if columns == 1 else size.page
+    columns = len(drawings) if len(drawings) <= MOST_COLUMNS else min(MOST_COLUMNS, ceil(len(drawings) / 2))
+    rows, whole = ceil(len(drawings) / columns), COLUMN if columns == 1 else PAGE
     extents = np.array([one.upper - one.lower for one in drawings])
-    tall = min(float((extents[:, 1] / extents[:, 0]).max()), size.tallest)
+    tall = min(float((extents[:, 1] / extents[:, 0]).max()), TALLEST)
     figure = Figure(
-        figsize=(whole, rows * (whole / columns * tall + 0.2) + 0.5), layout="constrained", facecolor="white"
+        figsize=(whole, rows * (whole / columns * tall + 0.2) + 0.65), layout="constrained", facecolor="white"
     )
     grid = [*figure.subplots(rows, columns, squeeze=False).flat]
     points_per_metre = 72 * whole / columns / float(extents[:, 0].max())
@@ -251,17 +226,20 @@ def scene_figure(drawings: Sequence[Drawing], settings: PrintSettings | None = N
     for axes, drawing in zip(grid, drawings, strict=False):
         checkpoint()
         axes.set(xlim=(drawing.lower[0], drawing.upper[0]), ylim=(drawing.lower[1], drawing.upper[1]), aspect="equal")
-        axes.set_title(drawing.title, fontsize=size.type_size)
-        _draw(axes, drawing, size, points_per_metre, named)
-        _add_scale_bar(axes, drawing, size)
+        axes.set_title(drawing.title, fontsize=TYPE)
+        _draw(axes, drawing, points_per_metre, named)
+        _add_scale_bar(axes, drawing)
     for axes in grid:
         axes.set_axis_off()
+    is_hidden = any(mask.any() for drawing in drawings for strokes in drawing.strokes for mask in strokes.hidden)
     figure.legend(
         named.values(),
         named.keys(),
+        title=f"{PROJECTION}; {HIDDEN}" if is_hidden else PROJECTION,
+        title_fontsize=TYPE - 2,
         loc="outside lower center",
         ncols=2 * columns,
-        fontsize=size.type_size - 1,
+        fontsize=TYPE - 1,
         frameon=False,
         handlelength=1.6,
         columnspacing=1.2,
@@ -269,7 +247,7 @@ def scene_figure(drawings: Sequence[Drawing], settings: PrintSettings | None = N
     return figure
 
 
-def _draw(axes: Axes, drawing: Drawing, size: PrintSettings, points_per_metre: float, named: dict[str, Any]) -> None:
+def _draw(axes: Axes, drawing: Drawing, points_per_metre: float, named: dict[str, Any]) -> None:
     """Draw a scene; `named` keeps a handle of each name in the legend."""
     from matplotlib.lines import Line2D  # noqa: PLC0415 - an extra
 
@@ -277,10 +255,13 @@ def _draw(axes: Axes, drawing: Drawing, size: PrintSettings, points_per_metre: f
     for k, strokes in enumerate(drawing.strokes, 5):
         if not strokes.paths:
             continue
-        width = max(size.thinnest, strokes.width * points_per_metre)
+        width = max(THINNEST, strokes.width * points_per_metre)
         look: dict[str, Any] = {"color": strokes.colour, "linewidth": width, "dashes": (4, 2) if strokes.dashed else ()}
-        broken = np.concatenate([np.concatenate([path, np.full((1, 2), np.nan)]) for path in strokes.paths])
-        axes.plot(*broken.T, **look, zorder=k, solid_capstyle="round")
+        _plot(
+            axes, strokes.paths, [_widened(~mask) for mask in strokes.hidden], **look, zorder=k, solid_capstyle="round"
+        )
+        dots: dict[str, Any] = {"dashes": (0.2, 2.2), "dash_capstyle": "round", "linewidth": max(0.7 * width, 0.5)}
+        _plot(axes, strokes.paths, strokes.hidden, **{**look, **dots}, zorder=k)
         named[strokes.label] = Line2D([], [], **{**look, "linewidth": max(width, 0.8)})
         if strokes.heads:
             _draw_heads(axes, [path for path in strokes.paths if len(path) > 2], strokes.colour, k)
@@ -288,12 +269,28 @@ def _draw(axes: Axes, drawing: Drawing, size: PrintSettings, points_per_metre: f
             starts = np.array([path[0] for path in strokes.paths])
             axes.plot(*starts.T, "o", color=strokes.colour, markersize=2.4 * width, zorder=k)
     for one in drawing.levels:
-        named[one.label] = _draw_levels(axes, one, size)
+        named[one.label] = _draw_levels(axes, one)
     for label, (places, colour) in drawing.points.items():
         named[label] = axes.plot(*places.T, "o", color=colour, markersize=5, zorder=30)[0]
 
 
-def _draw_levels(axes: Axes, one: Levels, size: PrintSettings) -> Artist:
+def _widened(mask: Mask) -> Mask:
+    """The places (T,) of a mask with their neighbours."""
+    wide = mask.copy()
+    wide[1:] |= mask[:-1]
+    wide[:-1] |= mask[1:]
+    return wide
+
+
+def _plot(axes: Axes, paths: Sequence[Array], shown: Sequence[Mask], **look: Any) -> None:  # noqa: ANN401
+    """Draw the parts of paths (T_i, 2) that are shown (T_i,), as one line with gaps."""
+    parts = [np.where(mask[:, None], path, np.nan) for path, mask in zip(paths, shown, strict=True)]
+    broken = np.concatenate([np.concatenate([part, np.full((1, 2), np.nan)]) for part in parts])
+    if np.isfinite(broken).any():
+        axes.plot(*broken.T, **look)
+
+
+def _draw_levels(axes: Axes, one: Levels) -> Artist:
     """Draw level lines with their values, or a body; return what stands for them in the legend."""
     from matplotlib.lines import Line2D  # noqa: PLC0415 - an extra
     from matplotlib.patches import Patch  # noqa: PLC0415
@@ -304,7 +301,7 @@ def _draw_levels(axes: Axes, one: Levels, size: PrintSettings) -> Artist:
         return Line2D([], [], color=one.colour)
     lines = axes.contour(*across, values, levels=one.levels, colors=one.colour, linewidths=0.6, zorder=3)
     if not one.is_body:
-        axes.clabel(lines, fmt="%g", fontsize=size.type_size - 2, inline_spacing=2)
+        axes.clabel(lines, fmt="%g", fontsize=TYPE - 2, inline_spacing=2)
         return Line2D([], [], color=one.colour, linewidth=0.6)
     axes.contourf(*across, values, levels=[one.levels[0], np.inf], colors=one.colour, alpha=0.25, zorder=2)
     return Patch(facecolor=(one.colour, 0.25), edgecolor=one.colour, linewidth=0.6)
@@ -328,9 +325,8 @@ def _draw_heads(axes: Axes, paths: Sequence[Array], colour: str, zorder: int) ->
     axes.quiver(*middles.T, *ahead.T, color=colour, zorder=zorder, **look, **head)
 
 
-def _add_scale_bar(axes: Axes, drawing: Drawing, size: PrintSettings) -> None:
-    """Draw a bar of a known length below the scene's left corner."""
+def _add_scale_bar(axes: Axes, drawing: Drawing) -> None:
     x, y = drawing.lower - (0.0, 0.03 * (drawing.upper - drawing.lower)[0])
-    axes.plot([x, x + size.bar], [y, y], color="black", linewidth=1.5, clip_on=False, solid_capstyle="butt")
-    look: dict[str, Any] = {"va": "center", "fontsize": size.type_size - 1, "annotation_clip": False}
-    axes.annotate(f"{100 * size.bar:g} cm", (x + size.bar, y), (3, 0), textcoords="offset points", **look)
+    axes.plot([x, x + BAR], [y, y], color="black", linewidth=1.5, clip_on=False, solid_capstyle="butt")
+    look: dict[str, Any] = {"va": "center", "fontsize": TYPE - 1, "annotation_clip": False}
+    axes.annotate(f"{100 * BAR:g} cm", (x + BAR, y), (3, 0), textcoords="offset points", **look)

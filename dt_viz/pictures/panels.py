@@ -15,12 +15,9 @@ from dt_viz.obstacles.union import Union
 from dt_viz.pictures.slice_fields import ARROW_SPACING, everywhere, grid_lines, streamlines
 from dt_viz.scenario.slices import Slice, level_line
 
-MARGIN = 0.18
-"""Margin around the base attractor's rays, relative to their extent."""
-NEGLIGIBLE = 0.03
-"""Length of an arrow, relative to the longest, below which it is left out."""
-OUTLINE_SPACING = 0.006
-"""Spacing of the lattice in which an obstacle's outline is found, metres."""
+MARGIN = 0.18  # margin around the base attractor's rays, relative to their extent
+NEGLIGIBLE = 0.03  # length of an arrow, relative to the longest, below which it is left out
+OUTLINE_SPACING = 0.006  # spacing of the lattice in which an obstacle's outline is found, metres
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,18 +26,12 @@ class PanelPicture:
 
     title: str
     area: Slice
-    goal: Array | None = None
-    """(3,) where its motions end."""
-    rollouts: tuple[Array, ...] = ()
-    """(T_i, 3)."""
-    streamlines: tuple[Array, ...] = ()
-    """(T_i, 3)."""
-    demonstrations: tuple[Array, ...] = ()
-    """(T_i, 3)."""
-    points: Array = field(default_factory=lambda: np.zeros((0, 3)))
-    """(N, 3) middles of arrows."""
-    vectors: Array = field(default_factory=lambda: np.zeros((0, 3)))
-    """(N, 3) of any unit."""
+    goal: Array | None = None  # (3,) where its motions end
+    rollouts: tuple[Array, ...] = ()  # (T_i, 3)
+    streamlines: tuple[Array, ...] = ()  # (T_i, 3)
+    demonstrations: tuple[Array, ...] = ()  # (T_i, 3)
+    points: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (N, 3) middles of arrows
+    vectors: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (N, 3) of any unit
     outlines: Array = field(default_factory=lambda: np.zeros((0, 2, 3)))
     """(K, 2, 3) segments where obstacles cross the rectangle."""
     grid: Array = field(default_factory=lambda: np.zeros((0, 2, 3)))
@@ -122,8 +113,7 @@ class Fit:
 
     rays: Rays
     area: Slice
-    middle: Array
-    """(3,)."""
+    middle: Array  # (3,)
     scale: float
 
     @classmethod

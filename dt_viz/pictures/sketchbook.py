@@ -12,28 +12,23 @@ from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.rollouts import Rays
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.memo import Memo
-from dt_viz.pictures.occupancy import OccupancyPicture
 from dt_viz.pictures.panels import Fit, PanelPicture, base_panel, generator_arrows, generator_panel, system_panel
-from dt_viz.pictures.slice_fields import ColourPicture, FieldPicture, grid_lines
+from dt_viz.pictures.slice_fields import ColourPicture, FieldPicture, OccupancyPicture, grid_lines
 from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.tasks import Task
 
-BASE_TITLE = "base attractor"
-"""What is written over the base attractor."""
+BASE_TITLE = "base attractor"  # what is written over the base attractor
 
 
 @dataclass(frozen=True)
 class GeneratorPicture:
     """A generator V of ψ, ψ(s) = γ(t, s), on the slice; its flow straightens the motion."""
 
-    points: Array
-    """(N, 3), metres."""
-    displacements: Array
-    """(N, 3) t·V, metres: approximate displacements by the flow."""
+    points: Array  # (N, 3), metres
+    displacements: Array  # (N, 3) t·V, metres: approximate displacements by the flow
     motions: tuple[Array, ...]
     """The demonstrations on the manifold that this flow acts on, (T_i, 3), metres; empty for the mean of all flows."""
-    num_flows: int
-    """Number of flows that ψ is composed of."""
+    num_flows: int  # number of flows that ψ is composed of
 
 
 @dataclass(frozen=True)
@@ -41,12 +36,10 @@ class Pictures:
     """The pictures of a view; None for those that are not shown, or not computed yet."""
 
     field: FieldPicture | None = None
-    streamlines: tuple[Array, ...] | None = None
-    """Each (T_i, 3), metres."""
+    streamlines: tuple[Array, ...] | None = None  # each (T_i, 3), metres
     colour: ColourPicture | None = None
     generator: GeneratorPicture | None = None
-    grid: Array | None = None
-    """Segments (K, 2, 3) of the warped grid, metres."""
+    grid: Array | None = None  # segments (K, 2, 3) of the warped grid, metres
     panels: tuple[PanelPicture, ...] = ()
     """Those that the view shows; the last is the frame of the scene's own slice, if there are any."""
     occupancy: OccupancyPicture | None = None
@@ -70,8 +63,7 @@ class Sketchbook:
             rays: rays from ψ(starts) to ψ(goal).
             paths: (T_i, 3) their preimages, the rollouts, metres.
         """
-        self.task = task
-        """Task of the motion."""
+        self.task = task  # task of the motion
         self._flows, self._system, self._rays, self._paths = flows, system, rays, paths
         self._memo = Memo()
 

@@ -3,37 +3,38 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
+from dt_viz.avoidance.arm_field import JointLimits
+from dt_viz.flows.diffeomorphisms import Diffeomorphism
 from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.flows.rollouts import Bundle, Rays, refined
 from dt_viz.flows.systems import DiffeomorphicSystem
+from dt_viz.memo import cached_property
+from dt_viz.obstacles.occupancy import AvoidanceField
+from dt_viz.obstacles.shapes import CloudObstacle, Obstacle
+from dt_viz.obstacles.union import Union
+from dt_viz.robot.inverse_kinematics import track
+from dt_viz.robot.robot import Robot
 from dt_viz.scenario.scenario import SliceColour
 from dt_viz.scenario.slices import Slice, level_line
 
 # how densely a slice is covered; lengths in metres
-ARROW_SPACING = 0.030
-"""Spacing of the arrows."""
+ARROW_SPACING = 0.030  # spacing of the arrows
 LATTICE = 0.008
 """Spacing of the lattice on which functions are sampled; a coarse picture has the arrows'."""
-GRID_SPACING = 0.035
-"""Spacing in base space of the lines whose images are the warped grid."""
-COARSE_LATTICE = 0.012
-"""Spacing of the lattice on which those of a coarse picture are found."""
+GRID_SPACING = 0.035  # spacing in base space of the lines whose images are the warped grid
+COARSE_LATTICE = 0.012  # spacing of the lattice on which those of a coarse picture are found
 LEVEL_SPACING = 0.04
 """Spacing of the base attractor's circles whose images are the level lines of the Lyapunov value."""
 SEPARATION = 0.032
 """Distance from all other streamlines at which one may begin, and its least length; it ends at half of it."""
-MAX_OFFSET = 0.10
-"""Distance from the slice at which a streamline ends."""
-LINE = 0.006
-"""Distance between neighbouring samples of a drawn streamline."""
-COARSE_LINE = 0.014
-"""The distance of a coarse picture."""
+MAX_OFFSET = 0.10  # distance from the slice at which a streamline ends
+LINE = 0.006  # distance between neighbouring samples of a drawn streamline
+COARSE_LINE = 0.014  # the distance of a coarse picture
 
 Clearance = Callable[[Array], Array]
 """Function from points (N, 3) to their distances (N,) from the blocked region, metres, negative inside."""
@@ -43,10 +44,8 @@ Clearance = Callable[[Array], Array]
 class FieldPicture:
     """Velocities of a system on a slice."""
 
-    points: Array
-    """(N, 3), metres."""
-    velocities: Array
-    """(N, 3), m/s."""
+    points: Array  # (N, 3), metres
+    velocities: Array  # (N, 3), m/s
 
 
 @dataclass(frozen=True)
@@ -58,10 +57,8 @@ class ColourPicture:
     values: Array
     """(n, m) det J, or Lyapunov values in m²/s, along the first and second axes of the slice, from corner to corner;
     NaN in the blocked region."""
-    clearance: Array
-    """(n, m) distance from the blocked region, negative inside, metres."""
-    lines: Array
-    """(K, 2, 3) segments of level lines, metres."""
+    clearance: Array  # (n, m) distance from the blocked region, negative inside, metres
+    lines: Array  # (K, 2, 3) segments of level lines, metres
 
 
 class Samples:
@@ -77,13 +74,11 @@ class Samples:
             spacing: spacing of the lattice, metres.
         """
         self.system, self.area = system, area
-        self.grid = area.grid(spacing)
-        """(n, m, 3), metres."""
+        self.grid = area.grid(spacing)  # (n, m, 3), metres
         self.clearance = clearance(self.grid.reshape(-1, 3)).reshape(self.grid.shape[:2])
         """(n, m), metres."""
         self.free = self.clearance > 0
-        self.points = self.grid[self.free]
-        """(N, 3) free points, metres."""
+        self.points = self.grid[self.free]  # (N, 3) free points, metres
 
     @cached_property
     def jacobians(self) -> tuple[Array, Array]:
@@ -249,7 +244,6 @@ class _Marks:
 
 
 def _num_leading(mask: Mask) -> int:
-    """Return the number of leading true values."""
     return len(mask) if mask.all() else int(mask.argmin())
 
 
@@ -261,3 +255,107 @@ def _steps(values: Array) -> Array:
         ahead, behind = (np.insert(step, place, 0.0, axis=axis) for place in (step.shape[axis], 0))
         steps = np.maximum(steps, np.maximum(ahead, behind))
     return steps
+
+
+SPACING, COARSE_SPACING = 0.004, 0.010  # distances between neighbouring samples, metres
+NEAR = 0.006  # largest distance from the slice of the labelled points that are shown on it, metres
+MAX_POINTS = 300  # approximate largest number of these points
+
+
+@dataclass(frozen=True)
+class OccupancyPicture:
+    """Learned occupancy on a slice."""
+
+    area: Slice
+    probability: Array
+    """(n, m) p(o = 1 | s) along the first and second axes of the slice, from corner to corner."""
+    level: Array  # (K, 2, 3) segments of the line p = 1/2, metres
+    outline: Array  # (L, 2, 3) segments of the obstacles' true outline, metres
+    points: Array  # (K, 3) points of clouds near the slice, projected onto it, metres
+    occupied: Mask  # (K,) whether each of them is occupied
+
+
+def occupancy_picture(area: Slice, obstacles: Sequence[Obstacle], *, coarse: bool) -> OccupancyPicture:
+    """Compute the learned occupancy of all obstacles together.
+
+    Args:
+        area: the slice.
+        obstacles: any number of obstacles.
+        coarse: whether to use fewer samples, for a picture that is soon replaced.
+    """
+    world = area.grid(COARSE_SPACING if coarse else SPACING)
+    points, shape = world.reshape(-1, 3), world.shape[:2]
+    free = np.ones(len(points))
+    for obstacle in obstacles:
+        free *= 1 - learned_occupancy(obstacle, points)
+    probability = 1 - free.reshape(shape)
+    distance = Union(tuple(obstacles)).signed_distance(points).reshape(shape)
+    return OccupancyPicture(
+        area,
+        probability,
+        level_line(world, probability - 0.5),
+        level_line(world, -np.minimum(distance, 1e3)),
+        *_known(area, obstacles),
+    )
+
+
+def _known(area: Slice, obstacles: Sequence[Obstacle]) -> tuple[Array, Mask]:
+    """Return points (K, 3) of clouds on the slice, and whether they are occupied (K,)."""
+    clouds = [obstacle.labelled() for obstacle in obstacles if isinstance(obstacle, CloudObstacle)]
+    points = np.concatenate([np.zeros((0, 3)), *(points for points, _ in clouds)])
+    occupied = np.concatenate([np.zeros(0, dtype=bool), *(labels for _, labels in clouds)])
+    above, across = (points - area.centre) @ area.normal, area.across(points)
+    near = np.flatnonzero((np.abs(above) < NEAR) & (np.abs(across) < area.half_size).all(axis=1))
+    near = near[:: -(-len(near) // MAX_POINTS) or 1]
+    return area.at(across[near]), occupied[near]
+
+
+def learned_occupancy(obstacle: Obstacle, s: Array) -> Array:
+    """Compute p(o = 1 | s), (N,), of the map learned from an obstacle, at world points `s` (N, 3)."""
+    placed = obstacle.field("free-space", 1.0)
+    assert isinstance(placed.inner, AvoidanceField)
+    return placed.inner.occupancy.probability(placed.to_frame(s))
+
+
+STEP = 4e-3  # length of the steps that derivatives are taken from, metres at the hand
+MAX_MISS = 1e-3  # distance by which the hand may miss a place that still has an arrow, metres
+
+
+@dataclass(frozen=True, eq=False)
+class Lattice:
+    """Postures that hold the hand at the places where arrows begin: they depend on no motion, and on no obstacle."""
+
+    reached: Mask  # (M,) which of the places are within the arm's reach
+    postures: Array  # (N, n) Q at the reached ones, rad
+    derivatives: Array  # (N, n, 3) DQ there, rad/m
+
+    @classmethod
+    def of(cls, points: Array, robot: Robot, reference: Array) -> Lattice:
+        """Find the postures.
+
+        Args:
+            points: (M, 3) places of the hand, metres.
+            robot: the arm.
+            reference: (n,) posture that it stays near to, rad.
+        """
+        paths = points[:, None] + np.concatenate([np.zeros((1, 3)), STEP * np.eye(3)])
+        start = np.broadcast_to(reference, (len(paths), robot.num_joints))
+        tracked = track(robot, paths, start, reference=start)
+        reached = tracked.error.max(axis=1) <= MAX_MISS
+        q = tracked.q[reached]
+        return cls(reached, q[:, 0], np.moveaxis(q[:, 1:] - q[:, :1], 1, 2) / STEP)
+
+    def carried(self, velocities: Array, transform: Diffeomorphism, robot: Robot, obstacle: Union) -> FieldPicture:
+        """Carry arrows (M, 3), m/s, NaN where there is none, along by the whole arm's avoidance ψ_q.
+
+        That was made for the motions, and may leave arrows far from them in the obstacle: these are left out.
+        """
+        limits, speed = JointLimits(robot.lower, robot.upper), np.linalg.norm(velocities[self.reached], axis=1)
+        moving = speed > 0
+        seconds, ahead = STEP / speed[moving], velocities[self.reached][moving]
+        q = self.postures[moving]
+        step = (self.derivatives[moving] @ (seconds[:, None] * ahead)[..., None])[..., 0]
+        p = transform.inverse(limits.inside(np.concatenate([q, q + step])))
+        begin, end = robot.end_effector(p).reshape(2, -1, 3)
+        free = obstacle.signed_distance(begin) > 0
+        return FieldPicture(begin[free], ((end - begin) / seconds[:, None])[free])

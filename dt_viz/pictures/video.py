@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import os
 import subprocess
-import tempfile
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
-
-import numpy as np
-from numpy.typing import NDArray
 
 from dt_viz.errors import FormatError
+from dt_viz.folders import TemporaryFolder
 
 _HD = ("-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709")
 _ENCODING: Mapping[str, tuple[str, ...]] = {
@@ -25,18 +21,11 @@ _ENCODING: Mapping[str, tuple[str, ...]] = {
     ".gif": ("-filter_complex", "split[a][b];[a]palettegen=stats_mode=single[p];[b][p]paletteuse=new=1", "-loop", "0"),
 }
 """Arguments of ffmpeg by the suffix of the file; slide programs play MP4 in yuv420p that begins with its index."""
-VIDEO_SUFFIXES = tuple(_ENCODING)
-"""Suffixes of the files."""
-NICENESS = 10
-"""Niceness of ffmpeg: what follows a hand comes first."""
+VIDEO_SUFFIXES = tuple(_ENCODING)  # suffixes of the files
+NICENESS = 10  # niceness of ffmpeg: what follows a hand comes first
 
 
-def check_installed() -> None:
-    """Raise FormatError unless ffmpeg is there."""
-    _ffmpeg()
-
-
-def _ffmpeg() -> str:
+def ffmpeg() -> str:
     """Return the path of ffmpeg. Raises FormatError if there is none."""
     try:
         from imageio_ffmpeg import get_ffmpeg_exe  # noqa: PLC0415 - an extra
@@ -62,13 +51,15 @@ class Encoder:
         """
         frames = ("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", str(rate), "-i", "-")
         threads = ("-threads", "1", "-filter_threads", "1", "-filter_complex_threads", "1")
-        command = _ffmpeg(), "-loglevel", "error", *threads, *frames, *threads[:2], *_ENCODING[suffix]
-        self._folder = tempfile.TemporaryDirectory(prefix="dt-viz-", ignore_cleanup_errors=True)
+        command = ffmpeg(), "-loglevel", "error", *threads, *frames, *threads[:2], *_ENCODING[suffix]
+        self._folder = TemporaryFolder()
         self._file, self._said = (Path(self._folder.name) / name for name in (f"video{suffix}", "said.txt"))
         with self._said.open("wb") as said:
             self._process = subprocess.Popen(
                 (*command, str(self._file)), stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=said
             )
+        assert self._process.stdin is not None
+        self._input = self._process.stdin
         if hasattr(os, "setpriority"):
             with suppress(OSError):  # it has ended already
                 os.setpriority(os.PRIO_PROCESS, self._process.pid, NICENESS)
@@ -76,28 +67,21 @@ class Encoder:
     def __enter__(self) -> Encoder:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         self._process.kill()
         self._process.wait()
         with suppress(OSError):  # what it has not read
             self._input.close()
         self._folder.cleanup()
 
-    @property
-    def _input(self):  # noqa: ANN202 - a pipe
-        assert self._process.stdin is not None
-        return self._process.stdin
-
-    def write(self, frame: NDArray[np.uint8]) -> None:
-        """Add a frame (height, width, 3), RGB; wait while ffmpeg encodes those before.
+    def write(self, frame: bytes) -> None:
+        """Add the pixels of a frame, RGB, row by row; wait while ffmpeg encodes those before.
 
         Raises:
             FormatError: ffmpeg fails.
         """
         try:
-            self._input.write(frame.tobytes())
+            self._input.write(frame)
             self._input.flush()
         except OSError:
             raise self._failure() from None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.kernels.arm import BODY_POINT
 from dt_viz.kernels.blocks import clearance
+from dt_viz.memo import cached_property
 from dt_viz.obstacles.shapes import Obstacle, records
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.kinematics import KinematicChain, Kinematics

@@ -6,8 +6,6 @@ Each choice comes with the reason for it. Lengths are metres, angles radians.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import combinations
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
@@ -19,46 +17,25 @@ from dt_viz.robot.body_points import BodyPoints
 from dt_viz.robot.collision import SELF_MARGIN, CollisionModel
 from dt_viz.robot.kinematics import Kinematics
 from dt_viz.robot.link_distances import BetweenLinks, Poses
-from dt_viz.robot.meshes import LinkMesh
 from dt_viz.robot.urdf import listed, numbers
 
 AXES = {"x": (1.0, 0.0), "-x": (-1.0, 0.0), "y": (0.0, 1.0), "-y": (0.0, -1.0)}
-
-
-@dataclass(frozen=True)
-class ArmSearchSettings:
-    """Settings of what is found of an arm; lengths are parts of its reach."""
-
-    pitch: float = 0.8
-    """Angle of the hand below horizontal at home, rad."""
-    ahead: tuple[float, float] = (0.6, 0.05)
-    """Place of the hand at home, ahead of and above the second joint."""
-    manipulability: float = 0.12
-    """Manipulability at home above which more is no better, in reach³."""
-    least_manipulability: float = 0.05
-    """Manipulability below which a home of the SRDF is not taken, in reach³."""
-    least_ahead: float = 0.25
-    """Distance of the hand ahead of the base below which a home of the SRDF is not taken."""
-    room: float = 0.01
-    """Distance of links from each other and the table that is kept at home."""
-    num_candidates: int = 20_000
-    """Number of random postures that the search for home begins with."""
-    num_descending: int = 60
-    """Number of those that are improved."""
-    num_steps: int = 300
-    """Number of random steps of the improvement."""
-    num_postures: int = 150
-    """Number of random postures in which distances of links are compared."""
-    near: float = 0.02
-    """Distance below which two links count as near, at least."""
-    always: float = 0.9
-    """Part of the postures in which links are near that may touch."""
-    spread: float = 0.35
-    """Standard deviation of the postures near home for which levers are computed, rad."""
-    least_lever: float = 0.04
-    """Least lever of a joint."""
-    one_sided: float = 0.15
-    """Mean place of the hand over all postures beyond which the arm has a front."""
+# Lengths are parts of the arm's reach where nothing else is stated.
+PITCH = 0.8  # angle of the hand below horizontal at home, rad
+AHEAD, ABOVE = 0.6, 0.05  # place of the hand at home, from the second joint
+MANIPULABILITY = 0.12  # manipulability at home above which more is no better, in reach³
+LEAST_MANIPULABILITY = 0.05  # manipulability below which a home of the SRDF is not taken, in reach³
+LEAST_AHEAD = 0.25  # distance of the hand ahead of the base below which a home of the SRDF is not taken
+ROOM = 0.01  # distance of links from each other and the table that is kept at home
+NUM_CANDIDATES = 20_000  # number of random postures that the search for home begins with
+NUM_DESCENDING = 60  # number of those that are improved
+NUM_STEPS = 300  # number of random steps of the improvement
+NUM_POSTURES = 150  # number of random postures in which distances of links are compared
+NEAR = 0.02  # distance below which two links count as near, at least
+ALWAYS = 0.9  # part of the postures in which links are near that may touch
+SPREAD = 0.35  # standard deviation of the postures near home for which levers are computed, rad
+LEAST_LEVER = 0.04  # least lever of a joint
+ONE_SIDED = 0.15  # mean place of the hand over all postures beyond which the arm has a front
 
 
 class Ranges(NamedTuple):
@@ -80,11 +57,7 @@ class Ranges(NamedTuple):
 
 
 def find_front(
-    kinematics: Kinematics,
-    ranges: Ranges,
-    given: str | Sequence[float] | None,
-    home: Array | None,
-    settings: ArmSearchSettings,
+    kinematics: Kinematics, ranges: Ranges, given: str | Sequence[float] | None, home: Array | None
 ) -> tuple[Array, str]:
     """Find the horizontal unit vector (2,) ahead of the arm in the base frame of its URDF, and say why.
 
@@ -103,11 +76,9 @@ def find_front(
         hand, why = kinematics.end_effector(home)[:2], "where the hand is at the given home"
     else:
         postures = ranges.random(np.random.default_rng(0), 2000)
-        hand, why = (
-            kinematics.end_effector(postures)[:, :2].mean(axis=0),
-            "where the hand is in the mean of all postures",
-        )
-    if np.linalg.norm(hand) < settings.one_sided * kinematics.reach:
+        hand = kinematics.end_effector(postures)[:, :2].mean(axis=0)
+        why = "where the hand is in the mean of all postures"
+    if np.linalg.norm(hand) < ONE_SIDED * kinematics.reach:
         return np.array(AXES["x"]), "x, by convention: the arm reaches to all sides"
     front = hand / np.linalg.norm(hand)
     nearest = max(AXES.values(), key=lambda axis: float(front @ axis))
@@ -120,19 +91,8 @@ def to_front(front: Array) -> Array:
     return np.array([[-y, x, 0.0], [-x, -y, 0.0], [0.0, 0.0, 1.0]]) + 0.0
 
 
-def count_fixed(kinematics: Kinematics) -> tuple[int, str]:
-    """Count the first joints whose links stay where they are: one that turns about the vertical only spins its link."""
-    upright = abs(float(kinematics.joint_rotations[0][2, 2])) > np.cos(np.radians(5))
-    return int(upright), f"joint 1 is {'' if upright else 'not '}vertical"
-
-
 def find_touching(
-    solids: CollisionModel,
-    meshes: Sequence[LinkMesh],
-    ranges: Ranges,
-    semantic: Element | None,
-    protrusion: float,
-    settings: ArmSearchSettings,
+    solids: CollisionModel, ranges: Ranges, semantic: Element | None, protrusion: float, num: int = NUM_POSTURES
 ) -> tuple[frozenset[frozenset[str]], str]:
     """Find pairs of links, besides neighbours, that may touch, by name, and say why.
 
@@ -141,27 +101,21 @@ def find_touching(
     one for less than `SELF_MARGIN` that is wider by twice this.
     """
     arm, rng = solids.robot, np.random.default_rng(2)
-    told = [] if semantic is None else list(semantic.iter("disable_collisions"))
-    excepted = {
-        frozenset((str(pair.get("link1")), str(pair.get("link2")))) for pair in told if pair.get("reason") != "Never"
-    }
-    pairs = [
-        frozenset((a.name, b.name)) for a, b in combinations(meshes, 2) if b.joint - a.joint > 1
-    ]  # as `BetweenLinks` has them
-    named = frozenset(pairs) & excepted
-    pairs = [pair for pair in pairs if pair not in named]
-    measure, near = BetweenLinks(solids.links, named), max(settings.near * arm.reach, SELF_MARGIN + 2 * protrusion)
-    left, counts = np.arange(len(pairs)), np.zeros(len(pairs), int)
-    for num, q in enumerate(ranges.random(rng, settings.num_postures), start=1):
+    given = [] if semantic is None else list(semantic.iter("disable_collisions"))
+    excepted = {frozenset((pair.get("link1"), pair.get("link2"))) for pair in given if pair.get("reason") != "Never"}
+    named = frozenset(BetweenLinks(solids.links, frozenset()).pairs) & excepted
+    measure, near = BetweenLinks(solids.links, named), max(NEAR * arm.reach, SELF_MARGIN + 2 * protrusion)
+    left, counts = np.arange(len(measure.pairs)), np.zeros(len(measure.pairs), int)
+    for k, q in enumerate(ranges.random(rng, num), start=1):
         if not len(left):
             break
         poses = Poses.of(arm, q[None])
         for item in left[measure.lower(poses, np.zeros(len(left), np.intp), left) < near]:
             counts[item] += measure.distance(poses, 0, int(item), near) < near
-        left = left[counts[left] >= settings.always * num - 1]  # the others are apart often enough
-    always = {pairs[item] for item in left if counts[item] >= settings.always * settings.num_postures}
-    reasons = [f"{len(named)} of the SRDF"] if told else []
-    reasons.append(f"{len(always)} nearer than {1e3 * near:.0f} mm in {settings.always:.0%} of random postures")
+        left = left[counts[left] >= ALWAYS * k - 1]  # the others are apart often enough
+    always = {measure.pairs[item] for item in left if counts[item] >= ALWAYS * num}
+    reasons = [f"{len(named)} of the SRDF"] if given else []
+    reasons.append(f"{len(always)} nearer than {1e3 * near:.0f} mm in {ALWAYS:.0%} of random postures")
     return frozenset(named | always), ", ".join(reasons)
 
 
@@ -171,25 +125,18 @@ class HomeSearch:
     Its costs are those of an arm whose front is −y.
     """
 
-    def __init__(
-        self,
-        kinematics: Kinematics,
-        body: BodyPoints,
-        solids: CollisionModel,
-        ranges: Ranges,
-        settings: ArmSearchSettings,
-    ) -> None:
-        self._arm, self._body, self._solids, self._ranges, self._settings = kinematics, body, solids, ranges, settings
+    def __init__(self, kinematics: Kinematics, body: BodyPoints, solids: CollisionModel, ranges: Ranges) -> None:
+        self._arm, self._body, self._solids, self._ranges = kinematics, body, solids, ranges
         self._shoulder = kinematics.forward_kinematics(np.zeros(kinematics.num_joints))[1][1]
 
     def run(self) -> Array:
         """Find the posture (n,), rad."""
-        settings, (lower, upper) = self._settings, self._ranges
+        lower, upper = self._ranges
         rng = np.random.default_rng(1)
-        q = self._ranges.random(rng, settings.num_candidates)
-        q = q[np.argsort(self.cost(q))[: settings.num_descending]]
-        cost, step = self.cost(q), settings.spread
-        for _ in range(settings.num_steps):
+        q = self._ranges.random(rng, NUM_CANDIDATES)
+        q = q[np.argsort(self.cost(q))[:NUM_DESCENDING]]
+        cost, step = self.cost(q), SPREAD
+        for _ in range(NUM_STEPS):
             trial = np.clip(q + step * rng.normal(size=q.shape) * (rng.random(q.shape) < 0.5), lower, upper)
             found = self.cost(trial)
             better = found < cost
@@ -200,11 +147,10 @@ class HomeSearch:
 
     def cost(self, q: Array) -> Array:
         """Compute the costs (N,) of postures (N, n)."""
-        settings, (lower, upper), reach = self._settings, self._ranges, self._arm.reach
+        (lower, upper), reach = self._ranges, self._arm.reach
         chain = self._arm.chain(q.T)
-        ahead, above = settings.ahead
-        hand = chain.position - (self._shoulder + reach * np.array([0.0, -ahead, above]))[:, None]
-        tilt = chain.direction - np.array([0.0, -np.cos(settings.pitch), -np.sin(settings.pitch)])[:, None]
+        hand = chain.position - (self._shoulder + reach * np.array([0.0, -AHEAD, ABOVE]))[:, None]
+        tilt = chain.direction - np.array([0.0, -np.cos(PITCH), -np.sin(PITCH)])[:, None]
         bounded = upper - lower < 2 * np.pi
         middle = ((((q - (lower + upper) / 2) / (upper - lower)) ** 2) * bounded).sum(axis=1)
         moving = self._body.joint >= self._solids.num_fixed
@@ -214,24 +160,23 @@ class HomeSearch:
             20 * (hand**2).sum(axis=0) / reach**2
             + (tilt**2).sum(axis=0)
             + middle
-            - 6 * np.minimum(chain.manipulability() / reach**3, settings.manipulability)
-            + 30 * np.maximum(0.0, 2 * settings.room - heights / reach)
+            - 6 * np.minimum(chain.manipulability() / reach**3, MANIPULABILITY)
+            + 30 * np.maximum(0.0, 2 * ROOM - heights / reach)
             - 0.7 * chain.origins[:, 2].max(axis=0) / reach
             + 3 * aside / reach
         )
 
     def objection(self, q: Array) -> str | None:
         """Say why a posture (n,) is no home, or None."""
-        settings, reach = self._settings, self._arm.reach
-        chain, room = self._arm.chain(q[:, None]), settings.room * reach
+        reach, chain = self._arm.reach, self._arm.chain(q[:, None])
         near = self._solids.nearest_to_itself(q[None])
-        if near is not None and near.distance < min(room, 0.01):
+        if near is not None and near.distance < min(ROOM * reach, 0.01):
             return f"{near.links[0]} and {near.links[1]} are {1e3 * near.distance:.0f} mm apart"
         if self._solids.nearest_to_table(q[None]).distance < 0:
             return "the arm is below the table"
-        if -chain.position[1, 0] < settings.least_ahead * reach:
+        if -chain.position[1, 0] < LEAST_AHEAD * reach:
             return "the hand is not ahead of the base"
-        if float(chain.manipulability()[0]) < settings.least_manipulability * reach**3:
+        if float(chain.manipulability()[0]) < LEAST_MANIPULABILITY * reach**3:
             return "it is nearly singular"
         return None
 
@@ -263,31 +208,23 @@ def checked_home(given: Array, joint_names: Sequence[str], lower: Array, upper: 
 
 
 def find_home(
-    search: HomeSearch,
-    joint_names: Sequence[str],
-    lower: Array,
-    upper: Array,
-    given: Array | None,
-    semantic: Element | None,
+    search: HomeSearch, joint_names: Sequence[str], lower: Array, upper: Array, semantic: Element | None
 ) -> tuple[Array, str]:
-    """Find the ready posture (n,), rad: given, a state of the SRDF, or searched for; and say why."""
-    if given is not None:
-        return given, "given"
-    told = []
+    """Find the ready posture (n,), rad: a state of the SRDF, or searched for; and say why."""
+    refused = []
     for name, posture in semantic_homes(semantic, joint_names):
-        objection = (
-            "it is outside the limits" if ((posture < lower) | (posture > upper)).any() else search.objection(posture)
-        )
+        outside = ((posture < lower) | (posture > upper)).any()
+        objection = "it is outside the limits" if outside else search.objection(posture)
         if objection is None:
             return posture, f"state {name!r} of the SRDF"
-        told.append(f"not {name!r} of the SRDF: {objection}")
+        refused.append(f"not {name!r} of the SRDF: {objection}")
     q = search.run()
     objection = search.objection(q)
-    return q, "; ".join(["searched for", *told, *([f"but {objection}"] if objection else [])])
+    return q, "; ".join(["searched for", *refused, *([f"but {objection}"] if objection else [])])
 
 
-def find_levers(kinematics: Kinematics, home: Array, lower: Array, upper: Array, settings: ArmSearchSettings) -> Array:
+def find_levers(kinematics: Kinematics, home: Array, lower: Array, upper: Array) -> Array:
     """Compute how far the hand moves for each joint's turning, (n,) m/rad, root mean square over postures near home."""
-    near = np.clip(home + settings.spread * np.random.default_rng(0).normal(size=(400, len(home))), lower, upper)
+    near = np.clip(home + SPREAD * np.random.default_rng(0).normal(size=(400, len(home))), lower, upper)
     moved = np.linalg.norm(kinematics.chain(near.T).position_jacobian(), axis=1)
-    return np.maximum(np.sqrt((moved**2).mean(axis=1)), settings.least_lever * kinematics.reach)
+    return np.maximum(np.sqrt((moved**2).mean(axis=1)), LEAST_LEVER * kinematics.reach)

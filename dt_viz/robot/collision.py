@@ -9,62 +9,48 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dt_viz.checkpoints import checkpoint
 from dt_viz.flows.fields import Array, Indices
+from dt_viz.memo import cached_property
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.kinematics import Kinematics
 from dt_viz.robot.link_distances import AboveTable, BetweenLinks, FromObstacle, Link, Measure, Poses, page_names
-from dt_viz.robot.meshes import LinkMesh
+from dt_viz.robot.urdf import LinkMesh
+from dt_viz.scheduler import checkpoint
 from dt_viz.warning import ARM, Kind, MotionWarning
 
 SELF_REACH = 0.05
 """Distance of links beyond which it is not measured, metres: between the ends of the JACO's wrist are at most 7 cm."""
-SELF_MARGIN = 0.01
-"""Distance of links below which a problem is reported, metres."""
-KNOT_STRIDE = 4
-"""Stride in samples of the coarse path that a search begins with."""
+SELF_MARGIN = 0.01  # distance of links below which a problem is reported, metres
+KNOT_STRIDE = 4  # stride in samples of the coarse path that a search begins with
 
 
 @dataclass(frozen=True)
 class Nearest:
-    """The smallest distance on a path.
+    """The smallest distance on a path."""
 
-    Attributes:
-        distance: metres.
-        links: names of the link, or of both links.
-        at: place on the path, in samples from its start; 2.5 is halfway from the third to the fourth.
-    """
-
-    distance: float
-    links: tuple[str, ...]
-    at: float
+    distance: float  # metres
+    links: tuple[str, ...]  # names of the link, or of both links
+    at: float  # place on the path, samples from its start; 2.5 is halfway from the third to the fourth
 
 
-NOTHING = Nearest(np.inf, (), 0.0)
-"""The result without any obstacle."""
+NOTHING = Nearest(np.inf, (), 0.0)  # the result without any obstacle
 
 
 @dataclass(frozen=True)
 class CollisionReport:
-    """Smallest distances on a joint path.
-
-    Attributes:
-        obstacle: smallest signed distance of the arm from the obstacles, negative inside; infinite without any.
-        itself: smallest distance of two links that are not neighbours, 0 where they intersect; None beyond
-            `SELF_REACH`.
-        table: smallest signed height of the links that do not stand on the table.
-    """
+    """Smallest distances on a joint path."""
 
     obstacle: Nearest
+    """Smallest signed distance of the arm from the obstacles, negative inside; infinite without any."""
     itself: Nearest | None
-    table: Nearest
+    """Smallest distance of two links that are not neighbours, 0 where they intersect; None beyond `SELF_REACH`."""
+    table: Nearest  # smallest signed height of the links that do not stand on the table
 
     @property
     def depth(self) -> float:

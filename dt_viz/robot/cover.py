@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, product
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,55 +24,39 @@ from scipy.spatial import KDTree
 from dt_viz.files.triangles import grid_nodes, inside_of_grid, surface_samples
 from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.kernels.arm import BODY_POINT
-from dt_viz.kernels.bounding import step_to_the_farthest
-from dt_viz.obstacles.surfaces import golden_spiral
-from dt_viz.robot.meshes import LinkMesh, cells
+from dt_viz.kernels.proximity import step_to_the_farthest
+from dt_viz.obstacles.shapes import golden_spiral
+from dt_viz.robot.urdf import LinkMesh, cells
 
-Progress = Callable[[float], object]
-"""Is told the fraction that is done, in [0, 1]."""
+Progress = Callable[[float], object]  # called with the fraction that is done, in [0, 1]
 
 
 @dataclass(frozen=True)
 class CoverSettings:
     """Settings of a cover. Those of the file that ships with the JACO are in ``assets/make_body_points.py``."""
 
-    protrusion: float = 5.5e-3
-    """Distance by which the smallest spheres stick out of a link, metres."""
-    spacing: float = 3e-3
-    """Spacing of the points on the surface that spheres are chosen for, metres."""
-    fine_spacing: float = 1.5e-3
-    """Spacing of the points on the surface that their radii hold, metres."""
-    inner_spacing: float = 4.5e-3
-    """Spacing of the candidates in a link, metres."""
-    outer_spacing: float = 3e-3
-    """Spacing of the candidates on the surface, metres."""
+    protrusion: float = 5.5e-3  # distance by which the smallest spheres stick out of a link, metres
+    spacing: float = 3e-3  # spacing of the points on the surface that spheres are chosen for, metres
+    fine_spacing: float = 1.5e-3  # spacing of the points on the surface that their radii hold, metres
+    inner_spacing: float = 4.5e-3  # spacing of the candidates in a link, metres
     closing: float = 6e-3
     """Radius of balls that do not enter a link's hollows, metres: these count as solid, as what is open to
     one side alone. 0 leaves all hollows, and all candidates."""
-    rounding: float = 1.4
-    """Largest radius of a body point, in halves of its link's thickness."""
-    across: float = 1.15
-    """Least such radius, in that of a ball which holds the link across."""
-    radii: tuple[float, float] = (0.03, 0.085)
-    """Least and largest value of that radius, in the arm's reach."""
-    most: int = 16
-    """Largest number of body points of a link, whatever their radius."""
-    num_starts: int = 1
-    """Number of beginnings of the clustering, the best of which is taken."""
-    rounds: int = 12
-    """Rounds of the clustering."""
-    evening: float = 0.5
-    """Part of a difference in radius by which a ball gives up spheres in the next round."""
-    num_leaves: int = 4
-    """Largest number of spheres that are not parted any more."""
+    num_starts: int = 1  # number of beginnings of the clustering, the best of which is taken
+    rounds: int = 12  # rounds of the clustering
 
 
-GROUP = 0.02
-"""Size of the cells in which points are compared with spheres, metres."""
+OUTER_SPACING = 3e-3  # spacing of the candidates on the surface, metres
+ROUNDING = 1.4  # largest radius of a body point, in halves of its link's thickness
+ACROSS = 1.15  # least such radius, in that of a ball which holds the link across
+RADII = (0.03, 0.085)  # least and largest value of that radius, in the arm's reach
+MOST = 16  # largest number of body points of a link, whatever their radius
+EVENING = 0.5  # part of a difference in radius by which a ball yields spheres in the next round
+NUM_LEAVES = 4  # largest number of spheres that are not parted any more
+GROUP = 0.02  # size of the cells in which points are compared with spheres, metres
 NEARLY = 0.9
 """Part of the distance of two places by which one is deeper whose sphere holds most of the other's."""
-Spheres = np.ndarray
-"""(N, 4): centre and radius, metres."""
+Spheres = np.ndarray  # (N, 4): centre and radius, metres
 
 
 def covering_tree(
@@ -91,7 +74,7 @@ def covering_tree(
     parts = []
     for mesh, done in zip(meshes, work[1:] / work[-1], strict=True):
         for cluster in _clusters(cover(mesh, settings), largest(mesh), settings):
-            nodes, sizes = _tree(cluster, settings.num_leaves)
+            nodes, sizes = _tree(cluster)
             part = np.zeros(len(nodes), BODY_POINT)
             part["joint"], part["offset"] = mesh.joint, nodes[:, :3].round(5)
             part["radius"] = np.ceil(1e5 * (nodes[:, 3] + 1e-5)) / 1e5  # what rounding the centres costs
@@ -123,33 +106,26 @@ def protrusion(tree: NDArray[np.void], meshes: Sequence[LinkMesh], spacing: floa
     return float(away.mean()), float(away.max())
 
 
-def usual_radius(mesh: LinkMesh, reach: float, settings: CoverSettings) -> float:
+def usual_radius(mesh: LinkMesh, reach: float) -> float:
     """Compute the largest radius of a link's body points, metres, from its thickness: no less than holds it across."""
     points = mesh.vertices - mesh.vertices.mean(axis=0)
     along = points @ np.linalg.svd(points, full_matrices=False)[2].T  # principal axes, the longest first
     sides = np.sort(np.ptp(along, axis=0))
-    across = min(np.linalg.norm(along[:, 1:], axis=1).max(), np.hypot(*sides[:2]) / 2) + settings.protrusion
-    low, high = (part * reach for part in settings.radii)
-    return float(np.clip(max(settings.rounding * sides[1] / 2, settings.across * across), low, high))
-
-
-class _Solid(NamedTuple):
-    """What a link takes up, without hollows that no ball of the settings enters."""
-
-    inner: Array  # (N, 3) nodes of a grid in it, metres
-    outline: Array  # (M, 3) points on its outside
+    across = min(np.linalg.norm(along[:, 1:], axis=1).max(), np.hypot(*sides[:2]) / 2) + CoverSettings.protrusion
+    low, high = (part * reach for part in RADII)
+    return float(np.clip(max(ROUNDING * sides[1] / 2, ACROSS * across), low, high))
 
 
 def cover(mesh: LinkMesh, settings: CoverSettings) -> Spheres:
     """Find spheres that cover a link."""
     fine = _on_surface(mesh, settings.fine_spacing)
-    surface, spacing = fine, settings.fine_spacing
-    if settings.spacing > spacing:
-        surface, spacing = _thinned(fine, settings.spacing), settings.spacing
-    solid = _solid(mesh, fine, settings)
-    outer = surface[:: max(1, round((settings.outer_spacing / spacing) ** 2))]
-    centres = np.concatenate([solid.inner, outer])
-    radii = KDTree(solid.outline).query(centres)[0] + settings.protrusion - settings.fine_spacing / 4
+    surface, spacing = fine, settings.spacing
+    if spacing > settings.fine_spacing:
+        surface = fine[np.unique(cells(fine, spacing), return_index=True)[1]]
+    inner, outline = _solid(mesh, fine, settings)
+    outer = surface[:: max(1, round((OUTER_SPACING / spacing) ** 2))]
+    centres = np.concatenate([inner, outer])
+    radii = KDTree(outline).query(centres)[0] + settings.protrusion - settings.fine_spacing / 4
     # reduced so that what lies between points is covered, too
     taken = _greedy(surface, centres, radii - settings.fine_spacing / 2)
     return _fitted(centres[taken], radii[taken], fine, settings.fine_spacing / 2)
@@ -190,13 +166,7 @@ def _fitted(centres: Array, radii: Array, points: Array, slack: float) -> Sphere
 
 
 def _on_surface(mesh: LinkMesh, spacing: float) -> Array:
-    """Spread points over a link's surface, its vertices included."""
     return np.concatenate([mesh.vertices, surface_samples(mesh.vertices[mesh.faces], spacing)[0]])
-
-
-def _thinned(points: Array, cell: float) -> Array:
-    """Keep one point in each cell of a grid."""
-    return points[np.unique(cells(points, cell), return_index=True)[1]]
 
 
 def _area(mesh: LinkMesh) -> float:
@@ -204,14 +174,14 @@ def _area(mesh: LinkMesh) -> float:
     return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
 
 
-def _solid(mesh: LinkMesh, surface: Array, settings: CoverSettings) -> _Solid:
-    """Fill a link with nodes of a grid."""
+def _solid(mesh: LinkMesh, surface: Array, settings: CoverSettings) -> tuple[Array, Array]:
+    """Return nodes (N, 3) of a grid in a link without hollows that no ball of the settings enters, and its outside."""
     cell, pad = settings.inner_spacing, int(np.ceil(2 * settings.closing / settings.inner_spacing))
     lower, upper = surface.min(axis=0) - pad * cell, surface.max(axis=0) + pad * cell
     shape = tuple(int(n) for n in np.ceil((upper - lower) / cell) + 1)
     nodes, inside = grid_nodes(lower, cell, shape), inside_of_grid(mesh.vertices[mesh.faces], lower, cell, shape)
     if not settings.closing:
-        return _Solid(nodes[inside.ravel()], surface)
+        return nodes[inside.ravel()], surface
     at, shell = tuple(np.round((surface - lower) / cell).astype(int).T), np.zeros(shape, bool)
     shell[at] = True
     closed = _closed(inside | shell, settings.closing / cell)
@@ -220,7 +190,7 @@ def _solid(mesh: LinkMesh, surface: Array, settings: CoverSettings) -> _Solid:
     bridging = border[KDTree(surface).query(border)[0] > 1.5 * cell]
     outline = np.concatenate([surface[depth[at] < 2.5], bridging])
     solid = inside | (closed & ~shell)
-    return _Solid(nodes[(solid & _ridges(depth)).ravel()], outline)
+    return nodes[(solid & _ridges(depth)).ravel()], outline
 
 
 def _closed(inside: Mask, radius: float) -> Mask:
@@ -252,9 +222,9 @@ def _ridges(depth: Array) -> Mask:
 
 def _clusters(spheres: Spheres, largest: float, settings: CoverSettings) -> list[Spheres]:
     """Part spheres so that bounding spheres are not larger than wanted, or into as many parts as there may be."""
-    rng, most = np.random.default_rng(0), min(settings.most, len(spheres))
+    rng, most = np.random.default_rng(0), min(MOST, len(spheres))
     for k in range(1, most + 1):
-        found = [part for _ in range(settings.num_starts) for part in _clusterings(spheres, k, rng, settings)]
+        found = [part for _ in range(settings.num_starts) for part in _clusterings(spheres, k, rng, settings.rounds)]
         radius, best = min(found, key=lambda found: found[0])
         if radius <= largest or k == most:
             return best
@@ -262,18 +232,18 @@ def _clusters(spheres: Spheres, largest: float, settings: CoverSettings) -> list
 
 
 def _clusterings(
-    spheres: Spheres, k: int, rng: np.random.Generator, settings: CoverSettings
+    spheres: Spheres, k: int, rng: np.random.Generator, rounds: int
 ) -> Iterator[tuple[float, list[Spheres]]]:
     """Part spheres into at most k clusters, round by round, each after its largest radius."""
     centres, handicap = rng.choice(spheres[:, :3], k, replace=False), np.zeros(k)
-    for _ in range(settings.rounds):
+    for _ in range(rounds):
         away = np.linalg.norm(spheres[:, None, :3] - centres, axis=2) + spheres[:, 3:]
         nearest = (away + handicap).argmin(axis=1)
         kept = np.unique(nearest)
         clusters = [spheres[nearest == cluster] for cluster in kept]
         around = np.array([bounding_sphere(cluster) for cluster in clusters])
         yield around[:, 3].max(), clusters
-        centres, handicap = around[:, :3], handicap[kept] + settings.evening * (around[:, 3] - around[:, 3].mean())
+        centres, handicap = around[:, :3], handicap[kept] + EVENING * (around[:, 3] - around[:, 3].mean())
 
 
 def bounding_sphere(spheres: Spheres) -> Array:
@@ -283,16 +253,16 @@ def bounding_sphere(spheres: Spheres) -> Array:
     return np.append(centre, (np.linalg.norm(spheres[:, :3] - centre, axis=1) + spheres[:, 3]).max())
 
 
-def _tree(spheres: Spheres, num_leaves: int) -> tuple[Spheres, Indices]:
+def _tree(spheres: Spheres) -> tuple[Spheres, Indices]:
     """Return the spheres and those around halves of them, depth first, and the number (M,) in each with itself."""
     if len(spheres) == 1:
         return spheres, np.ones(1, dtype=int)
-    if len(spheres) <= num_leaves:
+    if len(spheres) <= NUM_LEAVES:
         parts = list(spheres[:, None])
     else:
         along = np.ptp(spheres[:, :3], axis=0).argmax()
         order = spheres[:, along].argsort()
         parts = [spheres[half] for half in np.array_split(order, 2)]
-    trees = [_tree(part, num_leaves) for part in parts]
+    trees = [_tree(part) for part in parts]
     nodes = np.concatenate([bounding_sphere(spheres)[None], *(nodes for nodes, _ in trees)])
     return nodes, np.concatenate([[len(nodes)], *(sizes for _, sizes in trees)])

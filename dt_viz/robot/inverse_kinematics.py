@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dt_viz.checkpoints import checkpoint
 from dt_viz.flows.fields import Array
 from dt_viz.flows.rotations import apart, rotation
 from dt_viz.kernels.tracking import Postures, settle, walk
 from dt_viz.robot.robot import Robot
+from dt_viz.scheduler import checkpoint
 
 
 class UnreachableError(ValueError):
@@ -25,24 +25,16 @@ class UnreachableError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class TrackedPath:
-    """A joint trajectory that follows an end-effector path.
+    """A joint trajectory that follows an end-effector path."""
 
-    Attributes:
-        q: (*B, T, n) joint angles, rad, inside the limits; continuous joints unwrapped.
-        error: (*B, T) distance of the end effector from the path, metres.
-        limits_hit: (*B, T) whether a joint was held at its limit.
-        manipulability: (*B, T) sqrt det(J Jᵀ), m³.
-        damped: (*B, T) whether the manipulability is that of a singularity: the pseudo-inverse is no longer the exact
-            Moore-Penrose one there, which would move the joints fast for little motion of the hand.
-        turned: (*B, T) angle of the hand from the orientation that is wanted, rad; 0 where none is.
-    """
-
-    q: Array
-    error: Array
-    limits_hit: NDArray[np.bool_]
-    manipulability: Array
+    q: Array  # (*B, T, n) joint angles, rad, inside the limits; continuous joints unwrapped
+    error: Array  # (*B, T) distance of the end effector from the path, metres
+    limits_hit: NDArray[np.bool_]  # (*B, T) whether a joint was held at its limit
+    manipulability: Array  # (*B, T) sqrt det(J Jᵀ), m³
     damped: NDArray[np.bool_]
-    turned: Array
+    """(*B, T) whether the manipulability is that of a singularity: the pseudo-inverse is no longer the exact
+    Moore-Penrose one there, which would move the joints fast for little motion of the hand."""
+    turned: Array  # (*B, T) angle of the hand from the orientation that is wanted, rad; 0 without one
 
 
 def inverse_kinematics(
@@ -136,7 +128,8 @@ def arriving(
     if orientation is None:
         cost += weight / 2 * ((chain.direction - direction[:, None]) ** 2).sum(axis=0)
     else:
-        cost += settings.orientation_weight / 2 * _turned(robot, q, np.broadcast_to(orientation, (len(q), 4))) ** 2
+        off = apart(robot.hand_orientation(q), np.broadcast_to(orientation, (len(q), 4)))
+        cost += settings.orientation_weight / 2 * off**2
     cost += settings.floor_weight * np.maximum(0.0, -chain.origins[:, 2]).sum(axis=0)
     cost[miss > settings.tolerance] = np.inf
     return q[np.argsort(cost, kind="stable")[: np.isfinite(cost).sum()]]
@@ -271,11 +264,6 @@ def targets_of(robot: Robot, positions: Array, orientations: ArrayLike | None) -
     return np.concatenate([positions, columns.reshape(*positions.shape[:-1], 9)], axis=-1)
 
 
-def _turned(robot: Robot, q: Array, orientations: Array) -> Array:
-    """Compute angles (N,), rad, of the hand at postures (N, n) from orientations (N, 4)."""
-    return apart(robot.hand_orientation(q), orientations)
-
-
 def _along(robot: Robot, targets: Array) -> Array:
     """Targets (*B, 3 or 12) whose distances are lengths along a path: a turn by an angle θ moves columns by √2·θ."""
     turns = np.full(targets.shape[-1], robot.sized_tracking.turn_length / np.sqrt(2))
@@ -307,10 +295,7 @@ def _walk(robot: Robot, paths: Array, starts: Array, posture: Postures, stride: 
 def _swept(robot: Robot, q: Array, paths: Array, posture: Postures, which: NDArray[np.intp]) -> Array:
     """Step all waypoints until none moves; q (B, T, n), targets (B, T, …), `which` (B,) of the postures they have."""
     each, settings = np.repeat(which, paths.shape[1]), robot.sized_tracking
-    begin, targets = (
-        np.array(q.reshape(-1, robot.num_joints), order="C"),
-        np.array(paths.reshape(-1, paths.shape[-1]), order="C"),
-    )
+    begin, targets = (np.array(part.reshape(-1, part.shape[-1]), order="C") for part in (q, paths))
     improving = settings.max_sweeps if paths.shape[-1] == 3 else settings.turning_sweeps
     limits = improving, settings.final_sweeps, settings.step_tolerance
     return settle(robot.tracking_arm, posture, begin, targets, each, *limits).reshape(q.shape)
@@ -321,8 +306,8 @@ def _report(robot: Robot, q: Array, path: Array, orientations: ArrayLike | None)
     manipulability = chain.manipulability().reshape(path.shape[:-1])
     turned = np.zeros(path.shape[:-1])
     if orientations is not None:
-        wanted = np.asarray(orientations, dtype=float).reshape(-1, 4)
-        turned = _turned(robot, q.reshape(-1, robot.num_joints), wanted).reshape(turned.shape)
+        wanted, flat = np.asarray(orientations, dtype=float).reshape(-1, 4), q.reshape(-1, robot.num_joints)
+        turned = apart(robot.hand_orientation(flat), wanted).reshape(turned.shape)
     return TrackedPath(
         q=q,
         error=np.linalg.norm(chain.position.T.reshape(path.shape) - path, axis=-1),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -13,7 +12,8 @@ from scipy.spatial.transform import Rotation
 from dt_viz.flows.fields import Array
 from dt_viz.flows.rotations import quaternions
 from dt_viz.kernels.arm import JOINT, chains, places
-from dt_viz.robot.meshes import constant
+from dt_viz.memo import cached_property
+from dt_viz.robot.urdf import constant
 
 T = TypeVar("T", bound="Kinematics")
 REFERENCE_REACH = 0.9851132221222917
@@ -25,14 +25,10 @@ WORKING_RADIUS = 0.95
 class KinematicChain(NamedTuple):
     """Forward kinematics with the batch last, where a rotation costs one matrix product for the whole batch."""
 
-    axes: Array
-    """(n, 3, 3, N): [joint, column of the rotation, component], base frame."""
-    origins: Array
-    """(n, 3, N) of the joints, metres."""
-    position: Array
-    """(3, N) of the end effector, metres."""
-    direction: Array
-    """(3, N) unit vectors along the hand."""
+    axes: Array  # (n, 3, 3, N): [joint, column of the rotation, component], base frame
+    origins: Array  # (n, 3, N) of the joints, metres
+    position: Array  # (3, N) of the end effector, metres
+    direction: Array  # (3, N) unit vectors along the hand
 
     def position_jacobian(self) -> Array:
         """Compute the velocity of the end effector for each joint's, (n, 3, N), m/rad."""
@@ -53,14 +49,10 @@ class KinematicChain(NamedTuple):
 class Kinematics:
     """A serial arm of n revolute joints about their own z axes."""
 
-    joint_rotations: Array
-    """(n, 3, 3) orientation of each joint in the previous one, at angle zero."""
-    joint_translations: Array
-    """(n, 3) position of each joint in the previous one, metres."""
-    end_effector_offset: Array
-    """(3,) position of the end effector in the last joint, metres."""
-    hand_axis: Array
-    """(3,) direction of the hand in the last joint, of any length but 0."""
+    joint_rotations: Array  # (n, 3, 3) orientation of each joint in the previous one, at angle zero
+    joint_translations: Array  # (n, 3) position of each joint in the previous one, metres
+    end_effector_offset: Array  # (3,) position of the end effector in the last joint, metres
+    hand_axis: Array  # (3,) direction of the hand in the last joint, of any length but 0
     hand_rotation: Array
     """(3, 3) orientation of the hand in the last joint: that of the end effector's frame, its axes renamed where z is
     not the one along the hand."""

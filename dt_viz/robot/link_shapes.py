@@ -1,7 +1,7 @@
 """Shapes of an arm's links, read from a URDF: solids for collisions, and coloured meshes that are drawn.
 
-Pinocchio reads a URDF that is reduced to what is needed: joints that are no part of the chain (grippers, other
-branches) are fixed, and addresses of meshes are paths. Links without collision shapes have those that are drawn.
+Pinocchio reads the URDF, in which addresses of meshes are paths, and locks joints that are no part of the chain
+(grippers, other branches). Links without collision shapes have those that are drawn.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -10,7 +10,7 @@ branches) are fixed, and addresses of meshes are paths. Links without collision 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
@@ -24,9 +24,8 @@ from scipy.spatial.transform import Rotation
 from dt_viz.errors import FormatError
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.robot.kinematics import Kinematics
-from dt_viz.robot.meshes import LinkMesh, VisualMesh, constant
 from dt_viz.robot.tool_chain import ArmChain
-from dt_viz.robot.urdf import Description
+from dt_viz.robot.urdf import Description, LinkMesh, VisualMesh, constant
 
 SHAPES = ("box", "cylinder", "sphere", "mesh")
 COLOURED = (".dae", ".obj", ".glb", ".gltf", ".ply")
@@ -37,16 +36,10 @@ SHORTEST_HAND = 0.03
 """Least distance of the tool from the last joint for that to be the hand's direction, metres; else that is its z."""
 
 
-class Reduced(NamedTuple):
-    """A URDF of a chain alone."""
+def resolved(description: Description, package_dirs: Sequence[Path]) -> tuple[str, list[Path]]:
+    """Return a URDF's text with its meshes as paths, and these; they are looked for in the folders, too.
 
-    text: str
-    files: tuple[Path, ...]
-    """Meshes that it needs."""
-
-
-def reduced(description: Description, chain: ArmChain, package_dirs: Sequence[Path]) -> Reduced:
-    """Reduce a URDF to a chain, its links with all that is fixed to them; meshes are looked for in the folders, too.
+    It has what `read_shapes` needs, and no limits.
 
     Raises:
         FormatError: A mesh is missing, or a shape is of another kind.
@@ -54,45 +47,25 @@ def reduced(description: Description, chain: ArmChain, package_dirs: Sequence[Pa
     root, files = ElementTree.Element("robot", name=description.name), []
     for name, element in description.links.items():
         link = ElementTree.SubElement(root, "link", name=name)
-        shapes = {tag: copy.deepcopy(element.findall(tag)) for tag in ("collision", "visual")}
-        if not shapes["collision"]:
-            shapes["collision"] = copy.deepcopy(shapes["visual"])
-        for tag, found in shapes.items():
-            for shape in found:
-                kind = shape.find("geometry/*")
-                if kind is None or kind.tag not in SHAPES:
-                    raise FormatError(f"link {name}: {tag}", "nothing" if kind is None else kind.tag, ", ".join(SHAPES))
-                if kind.tag == "mesh":
-                    file = _mesh_file(kind.get("filename", ""), description.path, package_dirs, f"link {name}: {tag}")
-                    kind.set("filename", str(file))
-                    files.append(file)
-                shape.tag = tag
-                link.append(shape)
-    moving = {joint.name for joint in chain.joints}
+        for shape in copy.deepcopy([*element.findall("collision"), *element.findall("visual")]):
+            kind, field = shape.find("geometry/*"), f"link {name}: {shape.tag}"
+            if kind is None or kind.tag not in SHAPES:
+                raise FormatError(field, "nothing" if kind is None else kind.tag, ", ".join(SHAPES))
+            if kind.tag == "mesh":
+                files.append(_mesh_file(kind.get("filename", ""), description.path, package_dirs, field))
+                kind.set("filename", str(files[-1]))
+            link.append(shape)
     for name, joint in description.joints.items():
-        kept = ElementTree.SubElement(root, "joint", name=name, type=joint.kind if name in moving else "fixed")
-        kept.extend(joint.element.iterfind("parent"))
-        kept.extend(joint.element.iterfind("child"))
-        if name in moving:
-            kept.extend(part for tag in ("origin", "axis") for part in joint.element.iterfind(tag))
-            lower, upper, velocity = np.nan_to_num(joint.limits, posinf=0.0, neginf=0.0).tolist()
-            ElementTree.SubElement(
-                kept, "limit", lower=f"{lower!r}", upper=f"{upper!r}", velocity=f"{velocity!r}", effort="0"
-            )
-        elif chain.locked.get(name):
-            turn, place = joint.moved(chain.locked[name])
-            rpy = Rotation.from_matrix(turn).as_euler("xyz")
-            ElementTree.SubElement(
-                kept, "origin", xyz=" ".join(map(repr, place.tolist())), rpy=" ".join(map(repr, rpy.tolist()))
-            )
-        else:
-            kept.extend(joint.element.iterfind("origin"))
+        kept = ElementTree.SubElement(root, "joint", name=f"joint {name}", type=joint.kind)  # a link may have its name
+        kept.extend(part for tag in ("parent", "child", "origin") for part in joint.element.iterfind(tag))
+        if joint.moves:
+            ElementTree.SubElement(kept, "axis", xyz=" ".join(map(repr, joint.axis.tolist())))
+            ElementTree.SubElement(kept, "limit", lower="0", upper="0", velocity="0", effort="0")
     root.extend(description.materials)
-    return Reduced(ElementTree.tostring(root, encoding="unicode"), tuple(dict.fromkeys(files)))
+    return ElementTree.tostring(root, encoding="unicode"), list(dict.fromkeys(files))
 
 
 def _mesh_file(address: str, urdf: Path, package_dirs: Sequence[Path], field: str) -> Path:
-    """Find the file of a mesh."""
     scheme, _, rest = address.rpartition("://")
     if scheme in ("package", "model"):
         inside = Path(*Path(rest).parts[1:])  # of the package, whose folder may have another name
@@ -100,26 +73,27 @@ def _mesh_file(address: str, urdf: Path, package_dirs: Sequence[Path], field: st
         candidates += [folder / inside for folder in package_dirs]
     else:
         candidates = [urdf.parent / rest]
-    for path in candidates:
-        if path.is_file():
-            return path.resolve()
-    looked = f"a file; looked in {candidates[0]}" + (
-        " and others; name its package_dirs=" if len(candidates) > 1 else ""
-    )
-    raise FormatError(field, f"no mesh {address!r}", looked)
+    for path in filter(Path.is_file, candidates):
+        return path.resolve()
+    others = " and others; name its package_dirs=" if len(candidates) > 1 else ""
+    raise FormatError(field, f"no mesh {address!r}", f"a file; looked in {candidates[0]}{others}")
 
 
 class Shapes(NamedTuple):
     """What moves with the joints of a chain, in the URDF's base frame and with joints about z."""
 
     kinematics: Kinematics
-    meshes: tuple[LinkMesh, ...]
-    """Collision shapes, one for each link, by joint."""
+    meshes: tuple[LinkMesh, ...]  # collision shapes, one for each link, by joint
     visuals: tuple[VisualMesh, ...]
+
+    def turned(self, base: Array) -> Shapes:
+        """The same on a base that is turned by a rotation (3, 3)."""
+        meshes, visuals = (mesh.turned(base) for mesh in self.meshes), (mesh.turned(base) for mesh in self.visuals)
+        return Shapes(self.kinematics.turned(base), tuple(meshes), tuple(visuals))
 
 
 def read_shapes(text: str, chain: ArmChain) -> Shapes:
-    """Read kinematics and shapes of a reduced URDF.
+    """Read kinematics and shapes of a `resolved` URDF, reduced to a chain.
 
     With A_i e_z the axis of joint i in its own frame in the URDF, R_i' = A_{i-1}ᵀ R_i A_i, t_i' = A_{i-1}ᵀ t_i, and
     what moves with the joint is turned by A_iᵀ.
@@ -127,28 +101,25 @@ def read_shapes(text: str, chain: ArmChain) -> Shapes:
     Raises:
         FormatError: A mesh cannot be read, or no link has a shape.
     """
-    model = pin.buildModelFromXML(text)
+    model, (collisions, drawn) = _reduced(text, chain.locked)
     turns = [_to_axis(joint.axis) for joint in chain.joints]
     before = [np.eye(3), *turns]
     places = model.jointPlacements[1:]
     hand = model.frames[model.getFrameId(chain.tool, pin.FrameType.BODY)].placement
-    offset = _turned(hand.translation + hand.rotation @ chain.offset, turns[-1])
+    offset = (hand.translation + hand.rotation @ chain.offset) @ turns[-1]
     far = float(np.linalg.norm(offset)) > SHORTEST_HAND
-    axis = offset if far else _turned(hand.rotation[:, 2], turns[-1])
+    axis = offset if far else hand.rotation[:, 2] @ turns[-1]
+    joints = list(zip(places, before, turns, strict=False))
     kinematics = Kinematics(
-        constant(
-            [
-                _turned(_turned(place.rotation.T, first).T, turn)
-                for place, first, turn in zip(places, before, turns, strict=False)
-            ]
-        ),
-        constant([_turned(place.translation, first) for place, first in zip(places, before, strict=False)]),
+        constant([first.T @ place.rotation @ turn for place, first, turn in joints]),
+        constant([place.translation @ first for place, first, _ in joints]),
         constant(offset),
         constant(axis),
-        constant(_with_z_along(_turned(hand.rotation.T, turns[-1]).T, axis)),
+        constant(_with_z_along(turns[-1].T @ hand.rotation, axis)),
     )
     solids: dict[str, LinkMesh] = {}
-    for name, shape in _geometry(model, text, pin.GeometryType.COLLISION):
+    with_solid = {name for name, _ in collisions}
+    for name, shape in [*collisions, *((name, shape) for name, shape in drawn if name not in with_solid)]:
         mesh = LinkMesh(name, shape.parentJoint - 1, *_placed(*_triangles(shape.geometry), shape, before))
         solids[name] = _joined(solids[name], mesh) if name in solids else mesh
     if not any(mesh.joint > 0 for mesh in solids.values()):
@@ -159,7 +130,7 @@ def read_shapes(text: str, chain: ArmChain) -> Shapes:
             accepted = 'metres; of a mesh in millimetres: <mesh … scale="0.001 0.001 0.001"/>'
             raise FormatError(f"link {name}", f"{size:.3g} m across", accepted)
     visuals = []
-    for _, shape in _geometry(model, text, pin.GeometryType.VISUAL):
+    for _, shape in drawn:
         for name, vertices, faces, colour in _coloured(shape):
             visuals.append(VisualMesh(name, shape.parentJoint - 1, *_placed(vertices, faces, shape, before), colour))
     by_joint = sorted(solids.values(), key=lambda mesh: mesh.joint)
@@ -168,14 +139,25 @@ def read_shapes(text: str, chain: ArmChain) -> Shapes:
     return Shapes(kinematics, tuple(by_joint), tuple(visuals))
 
 
-def _geometry(model: Any, text: str, kind: Any) -> Iterator[tuple[str, Any]]:  # noqa: ANN401 - no stubs
-    """Yield shapes with the names of their links."""
+def _reduced(text: str, locked: Mapping[str, float]) -> tuple[Any, list[list[tuple[str, Any]]]]:
+    """Return the model without locked joints, and its collision shapes and visuals with the names of their links."""
     try:
-        found = pin.buildGeomFromUrdfString(model, text, kind, package_dirs=[]).geometryObjects
+        whole = pin.buildModelFromXML(text)
+        kinds = (pin.GeometryType.COLLISION, pin.GeometryType.VISUAL)
+        shapes = [pin.buildGeomFromUrdfString(whole, text, kind, package_dirs=[]) for kind in kinds]
     except (ValueError, RuntimeError) as error:
-        raise FormatError("mesh", " ".join(str(error).split())[:200], "STL, OBJ, DAE with triangles") from error
-    for shape in found:
-        yield model.frames[shape.parentFrame].name, shape
+        accepted = "origins of numbers; STL, OBJ, DAE with triangles"
+        raise FormatError("joint or mesh", " ".join(str(error).split())[:200], accepted) from error
+    q, numbers = pin.neutral(whole), [whole.getJointId(f"joint {name}") for name in locked]
+    for number, value in zip(numbers, locked.values(), strict=True):
+        joint = whole.joints[number]
+        if joint.nv == 1:
+            q[joint.idx_q : joint.idx_q + joint.nq] = [np.cos(value), np.sin(value)] if joint.nq == 2 else value
+    names = [[whole.frames[shape.parentFrame].name for shape in each.geometryObjects] for each in shapes]
+    model, placed = pin.buildReducedModel(whole, shapes, numbers, q)
+    return model, [
+        list(zip(*each, strict=True)) for each in zip(names, (s.geometryObjects for s in placed), strict=True)
+    ]
 
 
 def _to_axis(axis: Array) -> Array:
@@ -198,19 +180,13 @@ def _with_z_along(frame: Array, axis: Array) -> Array:
     return frame @ turn
 
 
-def _turned(vectors: Array, turn: Array) -> Array:
-    """Express vectors (*B, 3) in a turned frame; where it is not turned they stay what they are, to the last bit."""
-    return np.asarray(vectors) if np.array_equal(turn, np.eye(3)) else vectors @ turn
-
-
 def _placed(vertices: Array, faces: Indices, shape: Any, turns: Sequence[Array]) -> tuple[Array, NDArray[np.intp]]:  # noqa: ANN401
     """Place a shape in the frame of its joint."""
     placed = vertices @ shape.placement.rotation.T + shape.placement.translation
-    return constant(_turned(placed, turns[shape.parentJoint])), constant(faces, np.intp)
+    return constant(placed @ turns[shape.parentJoint]), constant(faces, np.intp)
 
 
 def _joined(mesh: LinkMesh, other: LinkMesh) -> LinkMesh:
-    """Join two shapes of a link."""
     faces = constant(np.concatenate([mesh.faces, other.faces + len(mesh.vertices)]), np.intp)
     return LinkMesh(mesh.name, mesh.joint, constant(np.concatenate([mesh.vertices, other.vertices])), faces)
 
@@ -232,26 +208,25 @@ def _triangles(shape: Any) -> tuple[Array, Indices]:  # noqa: ANN401 - no stubs
 
 def _coloured(shape: Any) -> Iterator[tuple[str, Array, Indices, tuple[int, int, int]]]:  # noqa: ANN401 - no stubs
     """Yield the parts of a drawn shape, each with a name and a colour: that of the file, or of the URDF."""
-    path = Path(shape.meshPath)
+    path, (vertices, faces) = Path(shape.meshPath), _triangles(shape.geometry)
     if path.suffix.lower() in COLOURED and hasattr(shape.geometry, "num_tris"):
         parts = _coloured_parts(path, np.asarray(shape.meshScale))
-        extents = [
-            (all_of.min(axis=0), all_of.max(axis=0))
-            for all_of in (shape.geometry.vertices(), np.concatenate([np.empty((0, 3)), *(part[1] for part in parts)]))
-            if len(all_of)
-        ]
-        if len(extents) == 2 and np.allclose(*extents, atol=1e-3):  # other readers scale and turn some files otherwise
+        every = np.concatenate([part[1] for part in parts]) if parts else np.full((1, 3), np.inf)
+        if np.allclose(_bounds(vertices), _bounds(every), atol=1e-3):  # other readers scale and turn some otherwise
             yield from parts
             return
     red, green, blue = (round(255 * float(value)) for value in shape.meshColor[:3])
-    yield path.name, *_triangles(shape.geometry), (red, green, blue)
+    yield path.name, vertices, faces, (red, green, blue)
+
+
+def _bounds(points: Array) -> Array:
+    return np.array([points.min(axis=0), points.max(axis=0)])
 
 
 def _coloured_parts(path: Path, scale: Array) -> list[tuple[str, Array, Indices, tuple[int, int, int]]]:
     """Read the parts of a file of meshes with their colours; none where that is not possible."""
     try:
-        scene = trimesh.load_scene(path)
-        found = scene.dump()
+        found = trimesh.load_scene(path).dump()
     except Exception:  # of whatever reader the file needs: its triangles are there without colours, too
         return []
     parts = []

@@ -18,10 +18,8 @@ from dt_viz.robot.models import NotStoredError, Progress, load_arm
 from dt_viz.robot.robot import Robot
 from dt_viz.robot.urdf import ArmError
 
-LOOK = 0.2
-"""Time after which somebody who waits is asked again whether the arm is wanted, seconds."""
-_one_arm = threading.Lock()
-"""Lock of those who make an arm: one at a time."""
+LOOK = 0.2  # time after which somebody who waits is asked again whether the arm is wanted, seconds
+_one_arm = threading.Lock()  # lock of those who make an arm: one at a time
 
 
 def load_aside(name: str, progress: Progress) -> Robot:
@@ -33,10 +31,8 @@ def load_aside(name: str, progress: Progress) -> Robot:
         ArmError: There is no such arm, or its description cannot be used.
         FileNotFoundError: The package example-robot-data is not installed, or its version has no such file.
     """
-    try:
+    with suppress(NotStoredError):
         return load_arm(name, progress, stored=True)
-    except NotStoredError:
-        pass
     while not _one_arm.acquire(timeout=LOOK):
         progress(0.0, "waits for another arm, which is being made")
     try:

@@ -14,6 +14,14 @@ from dt_viz.robot.robot import Robot
 
 REFERENCE_SHOULDER = (0.0, 0.0, 0.28)
 """Place of the JACO's shoulder, metres, which tasks were made for."""
+# Lengths are parts of the arm's reach where nothing else is stated.
+SCALES = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2)  # scales that are tried, in the first one
+AHEAD = (0.0, -0.1, 0.1, -0.2)  # moves ahead that are tried
+UP = (0.0, 0.1, 0.2, 0.3)  # moves upwards that are tried
+NUM_SAMPLES = 40  # number of samples of each path that are followed
+TURNED = 0.1  # angle of the hand from its orientations up to which these are followed, rad
+ERROR = 1e-3  # distance of the hand from a path up to which it is followed, metres
+ROOM = 0.01  # distance of links from each other that is kept, metres
 
 
 def is_jaco(robot: Robot) -> bool:
@@ -22,32 +30,11 @@ def is_jaco(robot: Robot) -> bool:
 
 
 @dataclass(frozen=True)
-class PlacementSettings:
-    """Settings of where a task is placed; lengths are parts of the arm's reach."""
-
-    scales: tuple[float, ...] = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2)
-    """Scales that are tried, in the first one."""
-    ahead: tuple[float, ...] = (0.0, -0.1, 0.1, -0.2)
-    """Moves ahead that are tried."""
-    up: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3)
-    """Moves upwards that are tried."""
-    num_samples: int = 40
-    """Number of samples of each path that are followed."""
-    turned: float = 0.1
-    """Angle of the hand from its orientations up to which these are followed, rad."""
-    error: float = 1e-3
-    """Distance of the hand from a path up to which it is followed, metres."""
-    room: float = 0.01
-    """Distance of links from each other that is kept, metres."""
-
-
-@dataclass(frozen=True)
 class Placement:
     """A map of space that scales and moves: x ↦ scale·x + shift."""
 
     scale: float
-    shift: tuple[float, float, float]
-    """Metres."""
+    shift: tuple[float, float, float]  # metres
 
     def __call__(self, points: Array) -> Array:
         """Map points (*B, 3), metres."""
@@ -58,7 +45,6 @@ def place(
     robot: Robot,
     paths: Sequence[Array],
     scale: float | None = None,
-    settings: PlacementSettings = PlacementSettings(),
     *,
     on_table: bool = False,
     orientations: Sequence[Array] | None = None,
@@ -72,19 +58,16 @@ def place(
         robot: the arm.
         paths: (T, 3) positions of the hand on each, metres, with the arm's front at −y.
         scale: the scale that is wanted; None takes the largest that fits, up to that of the arm's reach.
-        settings: what is tried.
         on_table: whether heights above the table are scaled only.
         orientations: (T, 4) of the hand on each, wxyz, that are followed, too.
 
     Raises:
         UnreachableError: No place fits, at the scale that is wanted; it says which one would.
     """
-    sampled = np.array([resampled(path, settings.num_samples) for path in paths])
-    wanted = (
-        None if orientations is None else np.array([resampled(each, settings.num_samples) for each in orientations])
-    )
+    sampled = np.array([resampled(path, NUM_SAMPLES) for path in paths])
+    wanted = None if orientations is None else np.array([resampled(each, NUM_SAMPLES) for each in orientations])
     first = robot.size if scale is None else scale
-    placement = fitting(robot, sampled, first, settings, on_table=on_table, orientations=wanted)
+    placement = fitting(robot, sampled, first, on_table=on_table, orientations=wanted)
     if scale is not None and placement.scale < scale:
         way_out = f"the largest scale that fits is about {placement.scale:.2g}"
         raise UnreachableError(f"{robot.title} cannot follow the task at the scale {scale:.3g}: {way_out}")
@@ -95,7 +78,6 @@ def fitting(
     robot: Robot,
     paths: Array,
     scale: float,
-    settings: PlacementSettings = PlacementSettings(),
     *,
     on_table: bool = False,
     orientations: Array | None = None,
@@ -105,17 +87,15 @@ def fitting(
     Raises:
         UnreachableError: no place fits.
     """
-    for part in settings.scales:
-        for placement in _candidates(robot, paths, part * scale, settings, on_table):
-            if follows(robot, placement(paths), settings, orientations):
+    for part in SCALES:
+        for placement in _candidates(robot, paths, part * scale, on_table):
+            if follows(robot, placement(paths), orientations):
                 return placement
-    least = settings.scales[-1] * scale
+    least = SCALES[-1] * scale
     raise UnreachableError(f"{robot.title} cannot follow the task anywhere ahead of it, even at the scale {least:.2g}")
 
 
-def follows(
-    robot: Robot, paths: Array, settings: PlacementSettings = PlacementSettings(), orientations: Array | None = None
-) -> bool:
+def follows(robot: Robot, paths: Array, orientations: Array | None = None) -> bool:
     """Return whether an arm follows paths (R, T, 3), metres, from their starts, with orientations (R, T, 4) if any."""
     if paths[..., 2].min() < 0:
         return False
@@ -129,38 +109,28 @@ def follows(
     except UnreachableError:
         return False
     tracked = track(robot, paths, starts, reference=reference, orientations=orientations)
-    missed = tracked.error.max() > settings.error or tracked.turned.max() > settings.turned
+    missed = tracked.error.max() > ERROR or tracked.turned.max() > TURNED
     if missed or tracked.limits_hit.any() or tracked.damped.any():
         return False
     for q in tracked.q:
-        if robot.self_clearance(q, settings.room) >= settings.room and _lowest(robot, q) > 0:
+        above = robot.links.positions(robot, q)[..., 2] > robot.links.radius
+        if robot.self_clearance(q, ROOM) >= ROOM and above.all():
             continue  # by the spheres around the links, which are quick
         near = robot.collision.nearest_to_itself(q[::4])
-        if (near is not None and near.distance < settings.room) or robot.collision.nearest_to_table(
-            q[::4]
-        ).distance < 0:
+        if (near is not None and near.distance < ROOM) or robot.collision.nearest_to_table(q[::4]).distance < 0:
             return False
     return True
 
 
-def _candidates(
-    robot: Robot, paths: Array, scale: float, settings: PlacementSettings, on_table: bool
-) -> Iterator[Placement]:
+def _candidates(robot: Robot, paths: Array, scale: float, on_table: bool) -> Iterator[Placement]:
     """Yield placements at a scale, the least moved first: about the shoulder, but no lower above the table."""
     about = robot.shoulder - scale * np.array(REFERENCE_SHOULDER)
     about[2] = max(about[2], min(1.0 - scale, 0.0) * paths[..., 2].min())
     about[2] *= not on_table
-    moves = sorted(
-        product(settings.ahead, (0.0,) if on_table else settings.up), key=lambda move: abs(move[0]) + abs(move[1])
-    )
+    moves = sorted(product(AHEAD, (0.0,) if on_table else UP), key=lambda move: abs(move[0]) + abs(move[1]))
     for ahead, up in moves:
         x, y, z = about + robot.reach * np.array([0.0, -ahead, up])
         yield Placement(scale, (float(x), float(y), float(z)))
-
-
-def _lowest(robot: Robot, q: Array) -> float:
-    """Compute the height above the table, metres, of the lowest sphere around the links at postures q (N, n), rad."""
-    return float((robot.links.positions(robot, q)[..., 2] - robot.links.radius).min())
 
 
 def resampled(path: Array, num: int) -> Array:

@@ -25,14 +25,10 @@ class ArmChain:
     """The joints that an arm moves, and its tool."""
 
     joints: tuple[Joint, ...]
-    tool: str
-    """Link that is the tool frame."""
-    locked: Mapping[str, float]
-    """Values of the joints that do not move, rad or metres."""
-    why: str
-    """Reason for the tool."""
-    offset: Array
-    """(3,) place of the tool in that link, metres."""
+    tool: str  # link that is the tool frame
+    locked: Mapping[str, float]  # values of the joints that do not move, rad or metres
+    why: str  # reason for the tool
+    offset: Array  # (3,) place of the tool in that link, metres
 
 
 def find_chain(
@@ -53,9 +49,7 @@ def find_chain(
     Raises:
         FormatError: There is no such frame, or a joint of the chain does not turn.
     """
-    given = (
-        dict(locked) if isinstance(locked, Mapping) else {name: _resting(description, name) for name in locked or ()}
-    )
+    given = locked if isinstance(locked, Mapping) else {name: _resting(description, name) for name in locked or ()}
     frame, offset = (end_effector, (0.0, 0.0, 0.0)) if isinstance(end_effector, str | None) else end_effector
     place = np.array(offset, dtype=float)
     if place.shape != (3,) or not np.isfinite(place).all():
@@ -72,19 +66,17 @@ def find_chain(
         raise FormatError(f"chain from {description.root} to {tool}", f"{len(path)} joints that move", accepted)
     names = {joint.name for joint in path}
     still = [name for name, joint in description.joints.items() if joint.moves and name not in names]
-    return ArmChain(
-        tuple(path), tool, {name: given.get(name, _resting(description, name)) for name in still}, why, place
-    )
+    values = {name: given.get(name, _resting(description, name)) for name in still}
+    return ArmChain(tuple(path), tool, values, why, place)
 
 
 def _tool(
     description: Description, end_effector: str | None, locked: Mapping[str, float], semantic: Element | None
 ) -> tuple[str, str]:
-    """Find the tool's link and say why."""
     links = description.links
     if end_effector is not None:
-        link = description.joints[end_effector].child if end_effector in description.joints else end_effector
-        link = end_effector if end_effector in links else link
+        joint = description.joints.get(end_effector)
+        link = joint.child if joint and end_effector not in links else end_effector
         if link not in links:
             raise FormatError("end effector", f"no link {end_effector!r}", listed(links))
         return link, "given"
@@ -114,13 +106,12 @@ def _distance(description: Description, link: str, chain: list[Joint]) -> float:
     """Compute the distance of a link from the last joint of a chain, metres."""
     place, path = np.zeros(3), description.to(link)
     for joint in reversed(path[path.index(chain[-1]) + 1 :] if chain else path):
-        turn, shift = joint.moved(0.0)
+        turn, shift = joint.origin
         place = shift + turn @ place
     return float(np.linalg.norm(place))
 
 
 def _is_gripper(joint: Joint) -> bool:
-    """Return whether the last joint of a chain is one of a gripper."""
     return any(word in joint.name.lower() for word in GRIPPER)
 
 

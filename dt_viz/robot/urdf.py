@@ -4,27 +4,26 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
+from typing import Any, TypeVar
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
-from xml.parsers import expat
 
 import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from dt_viz.errors import DataError, FormatError, naming
-from dt_viz.flows.fields import Array
+from dt_viz.errors import DataError, FormatError, parsing
+from dt_viz.flows.fields import Array, Indices
+from dt_viz.memo import cached_property
 
-MAX_BYTES = 20_000_000
-"""Size of the largest URDF that is read, bytes."""
-TURNING = ("revolute", "continuous")
-"""Types of joints that turn about an axis."""
-MOVING = (*TURNING, "prismatic", "floating", "planar")
-"""Types of joints that move."""
-USUAL_VELOCITY = 1.0
-"""Velocity limit of joints for which a file gives none, rad/s."""
+MAX_BYTES = 20_000_000  # size of the largest URDF that is read, bytes
+TURNING = ("revolute", "continuous")  # types of joints that turn about an axis
+MOVING = (*TURNING, "prismatic", "floating", "planar")  # types of joints that move
+TREE = "a tree, where each link is carried by one joint"
+USUAL_VELOCITY = 1.0  # velocity limit of joints for which a file gives none, rad/s
 
 
 class ArmError(DataError):
@@ -59,27 +58,20 @@ class Joint:
     def limits(self) -> tuple[float, float, float]:
         """Lower and upper limit, rad, infinite for a continuous joint, and the velocity's, rad/s."""
         limit, field = self.element.find("limit"), f"joint {self.name}: limit"
+        lower, upper, velocity = (numbers(limit, key, field, (0.0,)).item() for key in ("lower", "upper", "velocity"))
         if self.kind == "continuous":
             lower, upper = -np.inf, np.inf
         elif limit is None or limit.get("lower") is None or limit.get("upper") is None:
             raise FormatError(field, "none", '<limit lower="…" upper="…" velocity="…"/>, or the type continuous')
-        else:
-            lower, upper = (float(numbers(limit, side, field, (0.0,))[0]) for side in ("lower", "upper"))
         if not lower < upper:
             raise FormatError(field, f"lower {lower:g}, upper {upper:g}", "a lower limit below the upper one")
-        velocity = float(numbers(limit, "velocity", field, (0.0,))[0])
         return lower, upper, velocity if velocity > 0 else USUAL_VELOCITY
 
-    def moved(self, value: float) -> tuple[Array, Array]:
-        """Compute its rotation (3, 3) and translation (3,), metres, at a value, rad or metres."""
-        origin = self.element.find("origin")
-        turn = Rotation.from_euler("xyz", numbers(origin, "rpy", f"joint {self.name}: origin"))
-        place = numbers(origin, "xyz", f"joint {self.name}: origin")
-        if self.kind == "fixed" or not value:
-            return turn.as_matrix(), place
-        if self.kind in TURNING:
-            return (turn * Rotation.from_rotvec(value * self.axis)).as_matrix(), place
-        return turn.as_matrix(), place + turn.apply(value * self.axis)
+    @cached_property
+    def origin(self) -> tuple[Array, Array]:
+        """Rotation (3, 3) and translation (3,), metres, of its frame in the parent's."""
+        rpy, xyz = (numbers(self.element.find("origin"), key, f"joint {self.name}: origin") for key in ("rpy", "xyz"))
+        return Rotation.from_euler("xyz", rpy).as_matrix(), xyz
 
 
 class Description:
@@ -92,13 +84,13 @@ class Description:
         links: elements of the links, by name.
         joints: by name.
         into: the joint that carries each link but the root.
-        root: name of the link that nothing carries.
+        root: name of the link that no joint carries.
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        robot = _parsed(path)
-        self.name = robot.get("name") or path.stem
+        """Read a URDF. Raises FormatError where it is none, ArmError where it is no XML of a robot."""
+        robot = read_robot(path)
+        self.path, self.name = path, robot.get("name") or path.stem
         self.materials = robot.findall("material")
         self.links = dict(_named(robot, "link"))
         if not self.links:
@@ -111,17 +103,16 @@ class Description:
                     raise FormatError(f"joint {joint.name}", f"link {link!r}, which is not there", listed(self.links))
             if joint.child in self.into:
                 found = f"two joints that carry it, {self.into[joint.child].name} and {joint.name}"
-                raise FormatError(
-                    f"link {joint.child}", found, "a tree, where each link is carried by one joint: no loops"
-                )
+                raise FormatError(f"link {joint.child}", found, f"{TREE}: no loops")
             self.into[joint.child] = joint
-        roots = [link for link in self.links if link not in self.into]
-        if len(roots) != 1:
-            found = f"the roots {', '.join(roots[:5])}" if roots else "a loop of links"
+        try:
+            TopologicalSorter({link: [joint.parent] for link, joint in self.into.items()}).prepare()
+        except CycleError as error:
+            raise FormatError("links", "a loop of links", TREE) from error
+        self.root, *others = (link for link in self.links if link not in self.into)
+        if others:
+            found = f"the roots {listed([self.root, *others], 5)}"
             raise FormatError("links", found, "a tree with one link that no joint carries")
-        self.root = roots[0]
-        if sum(1 for _ in self.below(self.root)) < len(self.links):
-            raise FormatError("links", "a loop of links", "a tree, where each link is carried by one joint")
 
     def to(self, link: str) -> list[Joint]:
         """List the joints from the root to a link."""
@@ -131,74 +122,35 @@ class Description:
             link = joints[0].parent
         return joints
 
-    @cached_property
-    def _children(self) -> dict[str, list[str]]:
-        children: dict[str, list[str]] = {link: [] for link in self.links}
-        for joint in self.joints.values():
-            children[joint.parent].append(joint.child)
-        return children
-
-    def below(self, link: str) -> Iterator[str]:
-        """Yield a link and all that it carries."""
-        waiting = [link]
-        while waiting:
-            link = waiting.pop()
-            yield link
-            waiting += self._children[link]
-
 
 # --- Reading ---
 
 
-def _parsed(path: Path) -> Element:
-    """Parse a file, without entities."""
-    try:
-        size = path.stat().st_size
-        data = path.read_bytes() if size <= MAX_BYTES else b""
-    except OSError as error:
-        raise FormatError("file", error.strerror or "an error", "a URDF file that can be read") from error
-    if not data:
-        raise FormatError("file", f"{size:,} bytes", f"a URDF of up to {MAX_BYTES:,} bytes")
+class _Builder(ElementTree.TreeBuilder):
+    """A builder of trees from files without entities."""
 
-    def refuse(*_: object) -> None:
+    def doctype(self, *_: object) -> None:
+        """Refuse a document type."""
         raise FormatError("XML", "a document type or entities", "a URDF without them")
 
-    parser = expat.ParserCreate()
-    parser.StartDoctypeDeclHandler = refuse
-    try:
-        parser.Parse(data, True)
-        root = ElementTree.fromstring(data)
-    except (expat.ExpatError, ElementTree.ParseError, ValueError, LookupError) as error:
-        if isinstance(error, FormatError):
-            raise
-        raise FormatError("XML", f"something else ({error})", "a URDF: XML with the root <robot>") from error
-    if root.tag != "robot":
-        raise FormatError("XML", f"the root <{root.tag}>", "a URDF: XML with the root <robot>")
-    return root
 
-
-def read_semantic(path: Path) -> Element:
-    """Read an SRDF.
-
-    Raises:
-        ArmError: It is none.
-    """
-    with naming(ArmError, path):
-        return _parsed(path)
-
-
-def read_description(path: Path) -> Description:
-    """Read a URDF.
-
-    Raises:
-        ArmError: It is none.
-    """
-    with naming(ArmError, path):
-        return Description(path)
+def read_robot(path: Path) -> Element:
+    """Read a URDF or an SRDF. Raises ArmError where it is none."""
+    with parsing(ArmError, path, "file", accepted := "a URDF: XML with the root <robot>"):
+        try:
+            size = path.stat().st_size
+            data = path.read_bytes() if size <= MAX_BYTES else b""
+        except OSError as error:
+            raise FormatError("file", error.strerror or "an error", "a URDF file that can be read") from error
+        if not data:
+            raise FormatError("file", f"{size:,} bytes", f"a URDF of up to {MAX_BYTES:,} bytes")
+        root = ElementTree.fromstring(data, ElementTree.XMLParser(target=_Builder()))
+        if root.tag != "robot":
+            raise FormatError("XML", f"the root <{root.tag}>", accepted)
+        return root
 
 
 def _named(robot: Element, tag: str) -> Iterator[tuple[str, Element]]:
-    """Yield the elements of a kind with their names, which differ."""
     elements = robot.findall(tag)
     counts = Counter(element.get("name") for element in elements)
     for name, count in counts.items():
@@ -238,3 +190,42 @@ def listed(names: Iterable[str], most: int = 40) -> str:
     """Join names, at most so many of them."""
     names = list(names)
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+T = TypeVar("T", bound="LinkMesh")
+
+
+@dataclass(frozen=True, eq=False)
+class LinkMesh:
+    """Collision shape of a link; links that do not move, such as fingers, are those of the joint that carries them."""
+
+    name: str  # name of the link in the URDF
+    joint: int  # index of the joint that it moves with, −1 for the base
+    vertices: Array  # (V, 3) metres, in the frame of that joint; of the base in the base frame
+    faces: NDArray[np.intp]  # (F, 3) indices of vertices
+
+    def turned(self: T, base: Array) -> T:
+        """The same on a base that is turned by a rotation (3, 3): what is fixed to the base turns along."""
+        return self if self.joint >= 0 else replace(self, vertices=constant(self.vertices @ base.T))
+
+
+@dataclass(frozen=True, eq=False)
+class VisualMesh(LinkMesh):
+    """What is drawn of a link."""
+
+    colour: tuple[int, int, int] | None = None
+    """Red, green and blue up to 255; None is the page's colour of an arm."""
+
+
+def cells(points: Array, size: float) -> Indices:
+    """Number the cells of a grid (N,), in the order of their places, that points (N, 3) are in."""
+    cell = np.floor(points / size).astype(np.intp)
+    cell -= cell.min(axis=0)
+    return np.asarray(np.ravel_multi_index(tuple(cell.T), tuple(cell.max(axis=0) + 1)))
+
+
+def constant(values: ArrayLike, dtype: DTypeLike = float) -> NDArray[Any]:
+    """Return a read-only copy."""
+    array = np.array(values, dtype=dtype)
+    array.flags.writeable = False
+    return array

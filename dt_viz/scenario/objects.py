@@ -11,27 +11,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dt_viz.flows.fields import Array, Indices
-from dt_viz.obstacles.shapes import Box, Sphere
-from dt_viz.obstacles.surfaces import lathe
+from dt_viz.obstacles.shapes import Box, Sphere, lathe
 
-FINGERS = 0.035
-"""Distance of the hand's point from what the fingers push, metres."""
-WALL = 0.004
-"""Thickness of walls, metres."""
+FINGERS = 0.035  # distance of the hand's point from what the fingers push, metres
+WALL = 0.004  # thickness of walls, metres
 
 
 @dataclass(frozen=True)
 class Hand:
     """Where the hand is, has been just before, and was when it came to the goal."""
 
-    place: Array
-    """(3,), metres."""
-    before: Array
-    """(3,), metres."""
-    goal: Array
-    """(3,), metres; its place until then."""
-    arrived: float
-    """Time since it came there, seconds; 0 until then."""
+    place: Array  # (3,), metres
+    before: Array  # (3,), metres
+    goal: Array  # (3,), metres; its place until then
+    arrived: float  # time since it came there, seconds; 0 until then
 
 
 def scaled(sizes: tuple[float, float, float], scale: float) -> tuple[float, float, float]:
@@ -65,13 +58,10 @@ class TaskObject(ABC):
 class Pot:
     """An open pot on the table."""
 
-    x: float
-    """Position of the axis, metres."""
+    x: float  # position of the axis, metres
     y: float
-    radius: float = 0.055
-    """Radius of the opening, metres."""
-    height: float = 0.10
-    """Height of the rim above the table, metres."""
+    radius: float = 0.055  # radius of the opening, metres
+    height: float = 0.10  # height of the rim above the table, metres
 
     @property
     def opening(self) -> tuple[float, float, float]:
@@ -99,8 +89,7 @@ class Ball(TaskObject):
     """A ball that is carried to the goal and dropped there, into a pot or onto the table (fig. 8)."""
 
     pots: tuple[Pot, ...]
-    radius: float = 0.022
-    """Metres."""
+    radius: float = 0.022  # metres
 
     @property
     def start(self) -> None:
@@ -126,16 +115,12 @@ class Ball(TaskObject):
 class PushedBox(TaskObject):
     """A box on the table that the hand pushes along a direction, while it is behind it."""
 
-    middle: tuple[float, float]
-    """Where it stands at first, metres."""
-    direction: tuple[float, float]
-    """Unit vector along which it is pushed."""
+    middle: tuple[float, float]  # where it stands at first, metres
+    direction: tuple[float, float]  # unit vector along which it is pushed
     sizes: tuple[float, float, float] = (0.07, 0.09, 0.19)
     """Length along the direction, width and height, metres."""
-    friction: float = 0.5
-    """Way that it is taken aside for each metre that it is pushed."""
-    fingers: float = FINGERS
-    """Distance of the hand's point from what it pushes, metres."""
+    friction: float = 0.5  # way that it is taken aside for each metre that it is pushed
+    fingers: float = FINGERS  # distance of the hand's point from what it pushes, metres
 
     @classmethod
     def before(cls, hand: Array, goal: Array) -> PushedBox:
@@ -173,12 +158,9 @@ class PushedBox(TaskObject):
 class LiftedBox(TaskObject):
     """An open box on the table that the hand reaches into, grasps and lifts."""
 
-    middle: tuple[float, float]
-    """Where it stands at first, metres."""
-    grasp: float
-    """Height of the hand at which it is grasped, metres."""
-    sizes: tuple[float, float, float] = (0.22, 0.20, 0.08)
-    """Sides and height, metres."""
+    middle: tuple[float, float]  # where it stands at first, metres
+    grasp: float  # height of the hand at which it is grasped, metres
+    sizes: tuple[float, float, float] = (0.22, 0.20, 0.08)  # sides and height, metres
     near: float = 0.03
     """Distance from the place where it is grasped at which the hand takes it along, metres."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -9,7 +10,8 @@ import numpy as np
 
 from dt_viz.errors import FormatError, check_between
 from dt_viz.files.checks import check_at_most
-from dt_viz.flows.diffeomorphisms import Flow
+from dt_viz.files.texts import encoded
+from dt_viz.files.values import packed
 from dt_viz.flows.fields import Array
 from dt_viz.learning.demonstrations import MAX_COORDINATE, Demonstration, check_demonstrations
 from dt_viz.learning.imitation import Imitation
@@ -19,14 +21,11 @@ from dt_viz.scenario.scenario import MAX_DISTANCE
 from dt_viz.scenario.tasks import Move, Task, own_task
 from dt_viz.scenario.taught import Lesson
 
-MAX_MOVES = 20
-"""Largest number of times that a task is placed."""
-MAX_SEEN = 1000
-"""Largest number of findings, and of their characters."""
-MAX_LEARNED_STEPS = 1000
-"""Largest number of steps of all flows of what was learned; a fit here has up to some hundred."""
-SCALES = (1e-3, 1e3)
-"""Smallest and largest scale of a placement."""
+MAX_MOVES = 20  # largest number of times that a task is placed
+MAX_SEEN = 1000  # largest number of findings, and of their characters
+MAX_GAUSSIANS = 2 * 10**7
+"""Largest number of Gaussians of what was learned, once for each step and demonstration: a picture takes seconds."""
+SCALES = (1e-3, 1e3)  # smallest and largest scale of a placement
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,14 +37,11 @@ class Own:
     """Settings of the preparation: the defaults, but for its switches and the goal."""
     seen: tuple[str, ...] = ()
     """What was found about the demonstrations and shown before they were learned."""
-    moves: tuple[Move, ...] = ()
-    """How it was placed in an arm's reach."""
-    state: State = "auto"
-    """State that it is learned in where none is asked for."""
+    moves: tuple[Move, ...] = ()  # how it was placed in an arm's reach
+    state: State = "auto"  # state that it is learned in where none is asked for
     learned: Mapping[str, Array] | None = None
     """What was learned from the demonstrations elsewhere, in the plain state; see `Imitation.to_arrays`."""
-    lesson: Lesson | None = None
-    """What was taught for it in the page; None if that was nothing."""
+    lesson: Lesson | None = None  # what was taught for it in the page; None if that was nothing
 
     @classmethod
     def of(cls, task: Task) -> Own:
@@ -63,6 +59,16 @@ class Own:
         for scale, shift in self.moves:
             task = task.placed(scale, shift)
         return task
+
+    @property
+    def digest(self) -> str:
+        """Digest of all fields: tasks that are made from the same have the same."""
+        arrays = dict[str, np.ndarray]()
+        digest = hashlib.sha256(encoded({"own": packed(self, "own", arrays)}, {}))
+        for array in arrays.values():
+            digest.update(repr(array.shape).encode())
+            digest.update(array.tobytes())
+        return digest.hexdigest()
 
     def checked(self, source: str) -> Own:
         """Return the same with demonstrations that can be learned from.
@@ -88,9 +94,8 @@ class Own:
         own = replace(self, demonstrations=tuple(map(_as_given, self.demonstrations, usable)), lesson=lesson)
         if (imitation := own.task.imitation) is not None:
             check_between("dimension of what was learned", len(imitation.goal), *[usable[0].dimension] * 2)
-            parts = imitation.transform.parts if isinstance(imitation, Imitation) else ()
-            steps = sum(flow.steps for flow in parts if isinstance(flow, Flow))
-            check_at_most("steps of what was learned", steps, MAX_LEARNED_STEPS)
+            num = imitation.num_gaussians * len(usable) if isinstance(imitation, Imitation) else 0
+            check_at_most("Gaussians of what was learned, in all steps of all demonstrations", num, MAX_GAUSSIANS)
         check_between("farthest place", max(float(np.abs(path).max()) for path in own.task.paths), 0.0, MAX_COORDINATE)
         return own
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -14,14 +14,14 @@ from dt_viz.avoidance.avoidance import ArmAvoidance, Avoidance
 from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.avoidance.registry import BIAS
 from dt_viz.flows.fields import Array, Mask
+from dt_viz.memo import cached_property
 from dt_viz.obstacles.clouds import Cloud
 from dt_viz.obstacles.occupancy import sample_labels
-from dt_viz.obstacles.shapes import Box, CloudObstacle, MeshObstacle, Point, Sphere, as_point
+from dt_viz.obstacles.shapes import UPRIGHT, Box, CloudObstacle, MeshObstacle, Point, Sphere, as_point, lathe
 from dt_viz.obstacles.solids import Solid
-from dt_viz.obstacles.surfaces import lathe
 from dt_viz.scenario.objects import Pot
-from dt_viz.scenario.panels import BASE_PANEL, Panel
 from dt_viz.scenario.scenario import Scenario, View
+from dt_viz.scenario.slices import BASE_PANEL, Panel
 from dt_viz.scenario.stack import IMITATION, avoiding, plane_of, with_added
 from dt_viz.scenario.tasks import Task
 
@@ -43,8 +43,7 @@ FIG_6_PLACES: Mapping[str, Point] = {
 """Places of the sphere of fig. 6, for each task: the first at which `evaluate table1` measures, metres."""
 FIG_6 = {"compared": ("eflow-repulsive", "linear", "modulation"), "field": False, "ghost": False}
 """View of its scenes: the methods that follow a drag, one of each kind."""
-FIRST_BIAS = f"{BIAS.title} 1"
-"""Name of the layer of the first bias point."""
+FIRST_BIAS = f"{BIAS.title} 1"  # name of the layer of the first bias point
 
 
 @dataclass(frozen=True)
@@ -53,10 +52,8 @@ class PaperScene:
 
     name: str
     title: str
-    line: str
-    """Line that says what to see."""
-    task: str
-    """Name of its task."""
+    line: str  # line that says what to see
+    task: str  # name of its task
     make: Callable[[Task], Scenario]
     view: Mapping[str, Any] = field(default_factory=dict)
     """Fields of `View` that differ from the defaults."""
@@ -104,7 +101,6 @@ def _bottle_in_the_way(task: Task) -> Scenario:
 
 
 def _sphere_in_the_letter(diameter: float) -> Callable[[Task], Scenario]:
-    """Return what makes the scenario of fig. 2."""
     return lambda task: avoiding(task, Avoidance(task.sphere(diameter), plane=plane_of(task)))
 
 
@@ -136,12 +132,9 @@ def _gallery(name: str, title: str, task: str, others: tuple[str, ...]) -> Paper
 class Clover:
     """A smooth clover of three leaves around the y axis, metres."""
 
-    radius: float = 0.06
-    """Mean radius."""
-    thickness: float = 0.06
-    """Half the thickness."""
-    lobes: float = 0.4
-    """Height of the lobes, relative to the mean radius."""
+    radius: float = 0.06  # mean radius
+    thickness: float = 0.06  # half the thickness
+    lobes: float = 0.4  # height of the lobes, relative to the mean radius
 
     def holds(self, s: Array) -> Mask:
         """Return whether points `s` (N, 3), metres, lie in it."""
@@ -159,13 +152,7 @@ class Clover:
 CLOVER = Clover()
 
 
-def _cloud_in_the_letter(task: Task) -> Scenario:
-    """Sec. 4.4."""
-    return avoiding(task, Avoidance(CloudObstacle(task.obstacle_position, CLOVER.cloud, scale=task.size)))
-
-
 def _two_points(task: Task) -> Scenario:
-    """Fig. 4."""
     mean, plane = task.mean_path, plane_of(task)
     offsets = {30: (0.05, 0.0), 70: (0.0, -0.03)}  # to the right and up, metres, by the percent of its length
     places = [mean[at] + task.size * task.slice.axes @ offset for at, offset in offsets.items()]
@@ -256,7 +243,9 @@ SCENES: Mapping[str, PaperScene] = {
             "Sec. 4.4: labelled points in the S",
             "Known of the clover is only which points lie in it (dark). Strokes leave the occupancy learned from them.",
             "draw_s",
-            _cloud_in_the_letter,
+            lambda task: avoiding(
+                task, Avoidance(CloudObstacle(task.obstacle_position, CLOVER.cloud, UPRIGHT, task.size))
+            ),
             view=HAND_ONLY | {"colour": "occupancy", "field": False, "demonstrations": False},
         ),
         _comparison("others_push", "push, beside other methods", "push_box"),

@@ -14,12 +14,11 @@ from dt_viz.avoidance.transform import Anchored, Planar, Transform
 from dt_viz.errors import FormatError
 from dt_viz.flows.fields import Array, Mask
 from dt_viz.flows.rotations import turned
-from dt_viz.obstacles.shapes import Box, Cylinder, Obstacle, Point, Sphere, as_point, as_quaternion
-from dt_viz.scenario.scenario import MAX_DIAMETER, MIN_DIAMETER, Layer, Scenario, Start
+from dt_viz.obstacles.shapes import Obstacle, Point, Primitive, as_point, as_quaternion
+from dt_viz.scenario.scenario import Layer, Scenario, Start
 from dt_viz.scenario.tasks import OWN, Task
 
-SIZES = ("diameter", "height", "sizes", "scale")
-"""Fields of obstacles that are lengths."""
+SIZES = ("diameter", "height", "sizes", "scale")  # fields of obstacles that are lengths
 DIGITS = 7
 """Decimal places that lengths are rounded to, metres: there and back is the same to the last bit."""
 
@@ -29,8 +28,7 @@ class Relocation:
     """The map x ↦ scale·x + shift from where a task was to where it is now."""
 
     scale: float
-    shift: Point
-    """Metres."""
+    shift: Point  # metres
     first: tuple[Point, Point] | None = None
     """Where the task's first obstacle was and is now, metres: one that nobody has moved stays that."""
 
@@ -51,13 +49,7 @@ class Relocation:
         if self.first is not None and obstacle.position == self.first[0]:
             place = self.first[1]
         moved = obstacle.moved(place, obstacle.wxyz)
-        if not isinstance(moved, Sphere | Box | Cylinder):
-            return moved
-        names = [name for name in ("diameter", "height", "sizes") if hasattr(moved, name)]
-        sizes = {name: np.round(self.scale * np.array(getattr(moved, name)), DIGITS) for name in names}
-        bounded = {name: np.clip(size, MIN_DIAMETER, MAX_DIAMETER).tolist() for name, size in sizes.items()}
-        changes: Any = {name: tuple(size) if isinstance(size, list) else size for name, size in bounded.items()}
-        return replace(moved, **changes)
+        return moved.scaled(self.scale, DIGITS) if isinstance(moved, Primitive) else moved
 
     def transform(self, transform: Transform) -> Transform:
         """Map the places and lengths of a transform."""
@@ -84,6 +76,13 @@ def in_world(task: Task) -> tuple[Layer, ...]:
     return tuple(layers)
 
 
+def in_its_frame(stack: Sequence[Layer], task: Task) -> tuple[Layer, ...]:
+    """Return layers in the frame of a task's demonstrations, whose layers in the world are given: `in_world` undone."""
+    axes, scale = task.axes.T, 1 / task.scale
+    back = replace(task, origin=-scale * axes @ task.origin, axes=axes, scale=scale)
+    return tuple(replace(layer, transform=_in_world(layer.transform, back)) for layer in stack)
+
+
 def _in_world(transform: Transform, task: Task) -> Transform:
     if task.scale == 1 and not task.origin.any() and np.array_equal(task.axes, np.eye(3)):
         return transform
@@ -104,7 +103,6 @@ def _in_world(transform: Transform, task: Task) -> Transform:
 
 
 def _resized(obstacle: Obstacle, scale: float) -> Obstacle:
-    """The obstacle, so many times as large."""
     changed: Any = obstacle
     sizes = {field.name: getattr(obstacle, field.name) for field in fields(changed) if field.name in SIZES}
     return replace(changed, **{name: _scaled(size, scale) for name, size in sizes.items()})

@@ -20,26 +20,19 @@ from dt_viz.scenario.tasks import Task
 class RoamingSettings:
     """The round of an obstacle, and the sway of a goal; lengths in metres, times in seconds."""
 
-    swings: int = 5
-    """Number of swings through the motion and back on one round."""
-    turns: int = 3
-    """Number of turns of their direction."""
+    swings: int = 5  # number of swings through the motion and back on one round
+    turns: int = 3  # number of turns of their direction
     along: float = 0.3
     """Largest distance of the swings' middle from that of the motion, in lengths of the motion."""
     beside: float = 0.22
     """Distance from the motion at which an obstacle turns round, beside its own size."""
-    soft: float = 0.03
-    """Width in which the round bends where it comes near to table or pedestal."""
-    table_room: float = 0.01
-    """Height of the obstacle above the table."""
+    soft: float = 0.03  # width in which the round bends where it comes near to table or pedestal
+    table_room: float = 0.01  # height of the obstacle above the table
     pedestal_room: float = 0.20
     """Distance of the obstacle's surface from the axis of the arm's base."""
-    joining: float = 0.8
-    """Time constant with which an obstacle joins its round."""
-    goal_sway: float = 0.07
-    """Amplitude of a goal that moves."""
-    goal_periods: tuple[float, float] = (7.0, 11.0)
-    """Periods of a goal that moves, along two axes."""
+    joining: float = 0.8  # time constant with which an obstacle joins its round
+    goal_sway: float = 0.07  # amplitude of a goal that moves
+    goal_periods: tuple[float, float] = (7.0, 11.0)  # periods of a goal that moves, along two axes
 
 
 SETTINGS = RoamingSettings()

@@ -71,31 +71,23 @@ from dt_viz.scenario.taught import Lesson
 
 FORMAT, UNTAUGHT = 3, 2
 """Version of the text, raised where versions from before could not read it, and of one without any lesson."""
-READ = (1, UNTAUGHT, FORMAT)
-"""Versions that are read."""
-MAX_BYTES = 16 * 10**6
-"""Largest number of bytes of a text."""
+READ = (1, UNTAUGHT, FORMAT)  # versions that are read
+MAX_BYTES = 16 * 10**6  # largest number of bytes of a text
 MAX_PLAIN = 300_000
 """Largest number of bytes of all but its arrays: so much is checked within a second."""
 SIZES = (0.002, 2.0)
 """Smallest depth and largest radius of an obstacle, metres: beyond the page's sliders, as scenes scale with the arm."""
-THINNEST = 1e-4
-"""Smallest depth of an obstacle from a file, metres."""
-ROOM = 5.0
-"""Factor by which other lengths may be beyond the page's sliders, for the same reason."""
-SCALES = (0.02, 20.0)
-"""Smallest and largest scale of a shape of a figure."""
-STYLE_AMOUNTS = (-1.0, 2.0)
-"""Smallest and largest part of a style that is put on."""
+THINNEST = 1e-4  # smallest depth of an obstacle from a file, metres
+ROOM = 5.0  # factor by which other lengths may be beyond the page's sliders, for the same reason
+SCALES = (0.02, 20.0)  # smallest and largest scale of a shape of a figure
+STYLE_AMOUNTS = (-1.0, 2.0)  # smallest and largest part of a style that is put on
 MAX_FLOWS = MAX_PANELS = 20
 """Largest number of a flow of the imitation, and of panels: more than any task or stack has."""
-MAX_ROLLOUT = 10**4
-"""Largest number of the rollout that the arm follows; it is counted round."""
+MAX_ROLLOUT = 10**4  # largest number of the rollout that the arm follows; it is counted round
 SHIPPED: Mapping[str, Callable[[], Solid | Cloud]] = {"bottle": bottle, "clover": lambda: CLOVER.cloud}
 """Shapes of the paper's figures, by their names."""
 
-Sight = tuple[Point, Point]
-"""Position and look-at of a camera, metres."""
+Sight = tuple[Point, Point]  # position and look-at of a camera, metres
 
 
 class ScenarioError(DataError):
@@ -107,8 +99,7 @@ class Saved:
     """What is saved of a visitor's page."""
 
     scenario: Scenario
-    camera: Sight | None = None
-    """None where the camera shows what the task begins with."""
+    camera: Sight | None = None  # None where the camera shows what the task begins with
     own: Own | None = None
     """The scenario's task where its demonstrations are not those of a known one."""
     lesson: Lesson | None = None
@@ -120,8 +111,7 @@ class Known:
     """Names that a scenario may have."""
 
     tasks: Collection[str]
-    arms: Collection[str] | None = ("",)
-    """Names of arms; None are any."""
+    arms: Collection[str] | None = ("",)  # names of arms; None are any
     methods: Collection[str] | None = ()
     """Names of methods that ours is compared with; None are any."""
 
@@ -152,7 +142,9 @@ def is_saved(content: bytes) -> bool:
 
 def portable(scenario: Scenario) -> tuple[Scenario, int]:
     """Return a scenario without obstacles whose shapes come from files, and how many these were."""
-    left = _with_obstacles(scenario, lambda obstacle: None if _is_from_file(_named(obstacle)) else obstacle)
+    left = _with_obstacles(
+        scenario, lambda obstacle: None if isinstance(_named(obstacle), TriangleObstacle) else obstacle
+    )
     return left, len(scenario.obstacles) - len(left.obstacles)
 
 
@@ -245,10 +237,6 @@ def _named(obstacle: Obstacle) -> Any:  # noqa: ANN401 - an obstacle, or its sta
     return obstacle if name is None else Figure(obstacle.position, name, obstacle.wxyz, obstacle.scale)
 
 
-def _is_from_file(obstacle: Any) -> bool:  # noqa: ANN401 - as `_named` returns
-    return isinstance(obstacle, MeshObstacle | CloudObstacle)
-
-
 def _whole(obstacle: Any) -> Obstacle:  # noqa: ANN401
     return obstacle.obstacle if isinstance(obstacle, Figure) else obstacle
 
@@ -309,7 +297,6 @@ def _places(saved: Saved) -> Iterator[tuple[str, Point]]:
 
 
 def _turns(scenario: Scenario) -> Iterator[tuple[str, Quaternion]]:
-    """Yield all quaternions, and what each is of."""
     yield from (("wxyz of an obstacle", obstacle.wxyz) for obstacle in scenario.obstacles)
     if scenario.view.slice is not None:
         yield "wxyz of the slice", scenario.view.slice.wxyz

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any, Literal
 
 from dt_viz.avoidance.avoidance import ArmAvoidance, Avoidance
@@ -14,10 +13,10 @@ from dt_viz.avoidance.registry import AVOIDANCE
 from dt_viz.avoidance.transform import Transform
 from dt_viz.learning.imitation import Objective
 from dt_viz.learning.state import State
+from dt_viz.memo import cached_property
 from dt_viz.obstacles.shapes import Obstacle, Point
 from dt_viz.obstacles.union import Union
-from dt_viz.scenario.panels import Panel
-from dt_viz.scenario.slices import SlicePose
+from dt_viz.scenario.slices import Panel, SlicePose
 
 SliceColour = Literal["none", "det", "lyapunov", "occupancy"]
 """Quantity shown as colour on the slice: det J of the stack, its Lyapunov value, or the learned occupancy."""
@@ -29,18 +28,11 @@ SLICE_COLOURS: Mapping[SliceColour, str] = {
 }
 """Colours of the slice, with their names on the page."""
 
-MIN_DIAMETER, MAX_DIAMETER = 0.04, 0.30
-"""Smallest and largest diameter of an obstacle, metres."""
-MAX_OBSTACLES = 5
-"""Largest number of obstacles on the page; each costs time during a drag."""
-MAX_STARTS = 36
-"""Largest number of added starts on the page."""
-MAX_MARGIN = 0.05
-"""Largest margin, metres."""
-MAX_DISTANCE = 5.0
-"""Largest coordinate of a place on the page, metres."""
-MAX_SIGHT = 1e4
-"""Largest coordinate of a camera and of the point it looks at, metres."""
+MAX_OBSTACLES = 5  # largest number of obstacles on the page; each costs time during a drag
+MAX_STARTS = 36  # largest number of added starts on the page
+MAX_MARGIN = 0.05  # largest margin, metres
+MAX_DISTANCE = 5.0  # largest coordinate of a place on the page, metres
+MAX_SIGHT = 1e4  # largest coordinate of a camera and of the point it looks at, metres
 MIN_TURN, MAX_TURN = 0.5, 2.0
 """Smallest and largest norm of a quaternion; browsers send unit ones, with rounding."""
 
@@ -76,8 +68,7 @@ class View:
         "motion follows for long",
         needs=(),
     )
-    slice: SlicePose | None = None
-    """Pose of the slice; None is the task's."""
+    slice: SlicePose | None = None  # pose of the slice; None is the task's
     move_slice: bool = _offered(
         False, "Move the slice", "handles that move and tilt the slice, the plane on which arrows and colours are shown"
     )
@@ -106,8 +97,7 @@ class View:
     large_plots: bool = _offered(False, "Large plots", "in windows over the scene, which can be moved and docked")
     compared: tuple[str, ...] = _offered((), needs=("their_arm",))
     """Names of methods whose motions are shown beside ours."""
-    their_arm: str = ""
-    """Name of the one of them whose arm is shown, too; none if empty."""
+    their_arm: str = ""  # name of the one of them whose arm is shown, too; none if empty
     table: bool = _offered(True, "Table")
     selected: int = 0
     """Number of the obstacle that the panel changes; if there are fewer, it is the last one."""
@@ -140,14 +130,11 @@ class View:
     click_to_start: bool = _offered(
         False, "Click to start a rollout", f"on the slice, up to {MAX_STARTS}; drag a ball to move it"
     )
-    start_label: float | None = None
-    """Label that new starts get; see `Start`."""
-    playing: bool = True
-    """Whether the arm moves."""
+    start_label: float | None = None  # label that new starts get; see `Start`
+    playing: bool = True  # whether the arm moves
     replay: bool = _offered(False, "Replay", "its motion, finished, instead of an arm that reacts, with a timeline")
     speed: float = _offered(1.0, "Speed", "of the arm: 1 is real time", limits=(0.25, 3.0, 0.25))
-    bias: str = ""
-    """Name of the bias point that the panel changes; the newest if empty."""
+    bias: str = ""  # name of the bias point that the panel changes; the newest if empty
     bias_handles: bool = _offered(
         False,
         "Handles",
@@ -183,8 +170,7 @@ OFFERS: Mapping[str, Offer] = {
 class Start:
     """A place where a motion begins that nobody demonstrated."""
 
-    place: Point
-    """Place, metres."""
+    place: Point  # place, metres
     label: float | None = None
     """Label of the motion, in the augmented state; None is that of the nearest demonstrated start."""
 
@@ -195,8 +181,7 @@ class Layer:
 
     transform: Transform
     on: bool = True
-    name: str = ""
-    """Name on the page, unique in the stack."""
+    name: str = ""  # name on the page, unique in the stack
 
 
 AVOIDING = (Layer(ArmAvoidance(), name=AVOIDANCE.title),)
@@ -208,28 +193,21 @@ class Scenario:
     """All choices that a frame depends on: scenarios that are equal and have one passing give equal frames."""
 
     task: str
-    stack: tuple[Layer, ...] = AVOIDING
-    """The transforms on the imitation, from the inside out."""
+    stack: tuple[Layer, ...] = AVOIDING  # the transforms on the imitation, from the inside out
     imitation: bool = True
     """Whether the learned transform is in the stack; without it motions are straight."""
-    objective: Objective = "trajectory"
-    """What is fitted in the plain state."""
-    state: State = "auto"
-    """Whether motions are learned in the plain state or in the augmented one."""
+    objective: Objective = "trajectory"  # what is fitted in the plain state
+    state: State = "auto"  # whether motions are learned in the plain state or in the augmented one
     style: str = ""
     """Name of the style that is put on motions, of `STYLES`; none if empty. They are augmented then."""
-    style_amount: float = 1.0
-    """Part of it that is put on."""
+    style_amount: float = 1.0  # part of it that is put on
     warp: float = 1.0
     """s, from 0 to 1: every flow of the stack, the imitation's too, runs for this fraction of its duration."""
-    starts: tuple[Start, ...] = ()
-    """Those from which motions begin besides the task's."""
+    starts: tuple[Start, ...] = ()  # those from which motions begin besides the task's
     arm_rollout: int = 0
     """Number of the rollout that the arm follows: those from the task's starts come first, then those from `starts`."""
-    scene: str = ""
-    """Name of the paper's scene that it began as, if any."""
-    arm: str = ""
-    """Name of the arm, of those that are offered; the first one if empty."""
+    scene: str = ""  # name of the paper's scene that it began as, if any
+    arm: str = ""  # name of the arm, of those that are offered; the first one if empty
     view: View = field(default_factory=View)
     passing: Passing | None = field(default=None, compare=False)
     """Detours and reference posture of motions, kept while an obstacle is dragged; None until the session decides."""

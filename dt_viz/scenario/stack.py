@@ -13,8 +13,8 @@ from dt_viz.avoidance.registry import AVOIDANCE, entry_of
 from dt_viz.avoidance.transform import Anchored, Transform
 from dt_viz.metrics import resample_by_arc_length
 from dt_viz.obstacles.shapes import Point, as_point
-from dt_viz.scenario.panels import BASE_PANEL, Panel
 from dt_viz.scenario.scenario import Layer, Scenario
+from dt_viz.scenario.slices import BASE_PANEL, Panel
 from dt_viz.scenario.tasks import Task
 
 IMITATION, WHOLE_ARM = "Imitation", "Whole arm"

@@ -14,18 +14,15 @@ from dt_viz.scenario.scenario import MAX_STARTS, Scenario, Start
 from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.tasks import Task
 
-INNER = 0.8
-"""Part of the slice that a grid covers."""
-APART = 0.02
-"""Smallest distance between starts, metres."""
+INNER = 0.8  # part of the slice that a grid covers
+APART = 0.02  # smallest distance between starts, metres
 
 
 @dataclass(frozen=True)
 class Grid:
     """A grid of starts, and the numbers of places left out."""
 
-    starts: tuple[Start, ...]
-    """Starts of the scenario, the new ones last."""
+    starts: tuple[Start, ...]  # starts of the scenario, the new ones last
     num_blocked: int = 0
     """Number of places at or inside an obstacle, or where the arm that avoids it would touch it."""
     num_far: int = 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +15,7 @@ from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.demonstrations import Demonstration, DemonstrationError, lasa_files, load_demonstrations
 from dt_viz.learning.inspection import PreparationSettings
 from dt_viz.learning.interface import AnyImitation, State
+from dt_viz.memo import cached_property
 from dt_viz.metrics import resample_by_arc_length
 from dt_viz.numerics import unit
 from dt_viz.obstacles.shapes import Point, Sphere, as_point
@@ -34,11 +35,9 @@ DRAWING_AXES = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]).T
 DRAWING_SIZE = 0.40
 """Larger of width and height, metres, to which a drawing in other units is scaled."""
 
-OWN = "own_data"
-"""Name of the task that `own_task` makes."""
+OWN = "own_data"  # name of the task that `own_task` makes
 
-Move = tuple[float, Point]
-"""Scale and shift, metres, of a placement."""
+Move = tuple[float, Point]  # scale and shift, metres, of a placement
 POTS = (Pot(-0.16, -0.52), Pot(0.0, -0.52), Pot(0.16, -0.52))
 """Pots of `drop_pots`: left, centre and right as seen facing the robot."""
 
@@ -54,34 +53,26 @@ class Task:
     demonstrations: tuple[Demonstration, ...]
     name: str = ""
     title: str = ""
-    hint: str = ""
-    """Line that says what to try."""
-    origin: Array = field(default_factory=lambda: np.zeros(3))
-    """(3,), metres."""
-    axes: Array = field(default_factory=lambda: np.eye(3))
-    """(3, 3) orthonormal columns."""
+    hint: str = ""  # line that says what to try
+    origin: Array = field(default_factory=lambda: np.zeros(3))  # (3,), metres
+    axes: Array = field(default_factory=lambda: np.eye(3))  # (3, 3) orthonormal columns
     scale: float = 1.0
     slice: Slice = field(default_factory=lambda: Slice(np.zeros(3), np.eye(3)[:, :2], (1.0, 1.0)))
     camera: tuple[tuple[float, float, float], tuple[float, float, float]] = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     """Position and look-at, metres."""
     obstacle_position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """First position of the obstacle, metres."""
-    pots: tuple[Pot, ...] = ()
-    """Pots on the table, from left to right."""
-    objects: tuple[TaskObject, ...] = ()
-    """What the hand moves."""
-    state: State = "auto"
-    """State that it is learned in where none is asked for."""
-    draws: bool = False
-    """Whether the hand holds a pen and draws on the slice."""
+    pots: tuple[Pot, ...] = ()  # pots on the table, from left to right
+    objects: tuple[TaskObject, ...] = ()  # what the hand moves
+    state: State = "auto"  # state that it is learned in where none is asked for
+    draws: bool = False  # whether the hand holds a pen and draws on the slice
     preparation: PreparationSettings = field(default_factory=PreparationSettings)
     """Settings of what is done to the demonstrations before they are learned."""
     seen: tuple[str, ...] = ()
     """What was found about the demonstrations and shown before they were learned: it is no warning any more."""
     size: float = 1.0
     """Scale at which `placed` has put it, and at which what is added to it is made."""
-    moves: tuple[Move, ...] = ()
-    """How `placed` has put it, one after the other."""
+    moves: tuple[Move, ...] = ()  # how `placed` has put it, one after the other
     imitation: AnyImitation | None = None
     """What was learned from the demonstrations, in its state; None is learned here."""
     layers: tuple[Layer, ...] = ()

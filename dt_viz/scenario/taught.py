@@ -14,10 +14,8 @@ from dt_viz.learning.demonstrations import MAX_COORDINATE, Demonstration, check_
 from dt_viz.scenario.scenario import MAX_DISTANCE
 from dt_viz.scenario.slices import Slice
 
-MAX_TAKES = 50
-"""Largest number of takes that are taught for one task."""
-MAX_POINTS = 4096
-"""Largest number of points of the pointer in a take."""
+MAX_TAKES = 50  # largest number of takes that are taught for one task
+MAX_POINTS = 4096  # largest number of points of the pointer in a take
 NAME = r"(drawn|guided) [1-9]\d{0,8}"
 """Pattern of the names of takes: how they were taught, and a number."""
 
@@ -26,12 +24,9 @@ NAME = r"(drawn|guided) [1-9]\d{0,8}"
 class Taught:
     """A take that was taught. Compared by identity."""
 
-    kept: Demonstration
-    """What is kept of it: of a board in its coordinates, of the hand in space."""
-    drawn: Array
-    """(N, 3) places of the pointer, metres."""
-    board: Slice | None = None
-    """Board that it was drawn on; None was guided in space."""
+    kept: Demonstration  # what is kept of it: of a board in its coordinates, of the hand in space
+    drawn: Array  # (N, 3) places of the pointer, metres
+    board: Slice | None = None  # board that it was drawn on; None was guided in space
 
     @property
     def name(self) -> str:

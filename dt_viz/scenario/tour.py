@@ -15,8 +15,7 @@ from dt_viz.scenario.scenario import Scenario, Start, View
 from dt_viz.scenario.stack import avoiding, plane_of, with_added
 from dt_viz.scenario.tasks import Task
 
-TASK = "draw_s"
-"""Name of the task of all steps."""
+TASK = "draw_s"  # name of the task of all steps
 BIAS_AT, BIAS_OFFSET = 20, (-0.05, 0.04)
 """Percent of the mean demonstration's length beside which the bias point lies, and how far, right and up, metres."""
 NEW_STARTS = ((-0.9, 0.6), (-0.3, -0.9), (0.4, 0.9), (0.9, 0.2))
@@ -30,15 +29,11 @@ class TourStep:
     """A step of the tour: a scenario, and what is said of it."""
 
     title: str
-    text: str
-    """Two or three sentences."""
-    formula: str
-    """The one formula, HTML."""
-    trial: str
-    """What to try."""
+    text: str  # two or three sentences
+    formula: str  # the one formula, HTML
+    trial: str  # what to try
     make: Callable[[Task], Scenario]
-    view: Mapping[str, Any]
-    """Fields of `View` that differ from the defaults."""
+    view: Mapping[str, Any]  # fields of `View` that differ from the defaults
     grows: bool = False
     """Whether the warp is moved beside the text, and grows from 0 to 1 once by itself."""
 
@@ -60,10 +55,6 @@ def _from_elsewhere(task: Task) -> Scenario:
     area = task.slice
     places = area.centre + np.array(NEW_STARTS) * area.half_size @ area.axes.T
     return Scenario(task.name, (), starts=tuple(Start(as_point(place)) for place in places))
-
-
-def _hand_avoids(task: Task) -> Scenario:
-    return avoiding(task, Avoidance(task.sphere(), plane=plane_of(task)))
 
 
 def _arm_avoids(task: Task) -> Scenario:
@@ -111,7 +102,7 @@ STEPS = (
         "end at the same goal; dashed is the S without the sphere.",
         "z = ψ<sub>i</sub>(ψ<sub>o</sub>(y))",
         "Drag the sphere through the S.",
-        _hand_avoids,
+        lambda task: avoiding(task, Avoidance(task.sphere(), plane=plane_of(task))),
         FLAT | {"ghost": True, "demonstrations": False},
     ),
     TourStep(

@@ -8,9 +8,8 @@ from collections.abc import Callable, Mapping
 from dt_viz.learning.imitation import Progress
 from dt_viz.learning.store import FitStore
 from dt_viz.memo import Memo
-from dt_viz.robot.descriptions import local_descriptions
 from dt_viz.robot.making import load_aside
-from dt_viz.robot.models import ARMS, NUM_LOADED
+from dt_viz.robot.models import ARMS, NUM_LOADED, local_descriptions
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.tasks import TaskEntry
 from dt_viz.session.engine import Engine
@@ -52,7 +51,7 @@ class ArmStore:
             return robot, in_reach(self._tasks, robot, moves_recorded=True), Memo()
 
         robot, tasks, shared = self._memo("arm", name, load, newest=NUM_LOADED) if name else self._first
-        return Engine(tasks, self._fits, robot, shared)
+        return Engine(tasks, self._fits, robot, shared, name)
 
 
 class Engines:
@@ -62,6 +61,8 @@ class Engines:
         """Begin with an engine for the first arm; `new` makes others, None if there are none."""
         self._new = new or (lambda _name, _progress: first)
         self._lock, self._known = threading.Lock(), {"": first}
+        self.deleted = set[str]()
+        """Names of the visitor's own tasks that are not in the list of tasks any more."""
 
     def get(self, arm: str) -> Engine | None:
         """The engine for an arm, if that is there at once."""

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dt_viz.baselines.base import INSTALL, Method, NotFittedError, Planner, Problem
+from dt_viz.baselines.base import INSTALL, Method, NotFittedError, Planner, Problem, is_trained
 from dt_viz.baselines.registry import METHODS, problem_of
 from dt_viz.errors import Cancelled, end_if, never
-from dt_viz.flows.fields import Array, Indices
+from dt_viz.flows.fields import Array
 from dt_viz.memo import Memo, kept
 from dt_viz.metrics import discrete_frechet, distance_from_path, maximum_collision_distance, resample_by_arc_length
 from dt_viz.motion.following import ArmMotion, Follower, arm_samples
@@ -18,7 +18,8 @@ from dt_viz.motion.nominal import Learned
 from dt_viz.motion.profiles import NUM_SAMPLES
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.inverse_kinematics import UnreachableError, track
-from dt_viz.robot.retiming import within_velocity_limits
+from dt_viz.robot.joint_trajectory import within_velocity_limits
+from dt_viz.scenario.scenario import View
 from dt_viz.scenario.tasks import Task
 from dt_viz.session.drawing import arm_along
 from dt_viz.session.frame import Compared, Frame, Scores
@@ -26,10 +27,8 @@ from dt_viz.session.frame import Compared, Frame, Scores
 OURS = METHODS["ours"]
 OTHERS = tuple(method for method in METHODS.values() if method is not OURS)
 """Methods that a page can show beside ours."""
-NEWEST = 32
-"""Number of plans that are kept."""
-TOLERANCE = 1e-4
-"""By how much a maximum collision distance may be too small, metres."""
+NEWEST = 32  # number of plans that are kept
+TOLERANCE = 1e-4  # by how much a maximum collision distance may be too small, metres
 WAITS, NEXT, NO_WAY = "waits for the obstacle to rest", "waits for its turn", "finds no way"
 
 
@@ -37,10 +36,8 @@ WAITS, NEXT, NO_WAY = "waits for the obstacle to rest", "waits for its turn", "f
 class _Record:
     """What is known of a method around an obstacle; it grows while the obstacle rests."""
 
-    known: Compared | None = None
-    """Without curves and arm; None until its motions are planned."""
-    is_complete: bool = False
-    """Whether nothing is left to work out."""
+    known: Compared | None = None  # without curves and arm; None until its motions are planned
+    is_complete: bool = False  # whether nothing is left to work out
 
 
 def _around(method: Method, learned: Learned, frame: Frame) -> tuple[Hashable, ...]:
@@ -48,6 +45,16 @@ def _around(method: Method, learned: Learned, frame: Frame) -> tuple[Hashable, .
     if method is OURS:
         return method.name, learned, frame.drawn, bool(frame.blocked)
     return method.name, learned, frame.scenario.obstacle
+
+
+def is_offered(method: Method, task: str) -> bool:
+    """Return whether a method can be shown for the task of a name: whether its weights, if any, are made for that."""
+    return not method.weights or is_trained(method.weights, task)
+
+
+def chosen(view: View, task: str) -> list[Method]:
+    """Return the methods that a view shows beside ours for the task of a name."""
+    return [method for method in OTHERS if method.name in view.compared and is_offered(method, task)]
 
 
 class Comparison:
@@ -72,21 +79,19 @@ class Comparison:
             UnwantedError: it is cancelled, which is asked between parts of the work.
         """
         slow = [method for method in _chosen(frame) if self._record(method, learned, frame).known is None]
-        for k, method in enumerate(slow):
-            left = {later.name: NEXT for later in slow[k + 1 :]}
-            yield {method.name: f"planning … ({k + 1} of {len(slow)})", **left}
+        for k, method in enumerate(slow, start=1):
+            yield {method.name: f"planning … ({k} of {len(slow)})", **{later.name: NEXT for later in slow[k:]}}
             self._plan(method, frame, learned, cancelled)
         if slow:
             yield {}
         for method in _chosen(frame) if frame.scenario.obstacle.parts else ():
-            record = self._record(method, learned, frame)
-            if not record.is_complete:
-                known = record.known
-                if known is not None and known.scores is not None:
-                    depth = self._arm_depth(known, frame, learned, cancelled)
-                    record.known = replace(known, scores=replace(known.scores, arm_depth=depth))
-                record.is_complete = True
-                yield {}
+            if (record := self._record(method, learned, frame)).is_complete:
+                continue
+            if (known := record.known) is not None and known.scores is not None:
+                depth = self._arm_depth(known, frame, learned, cancelled)
+                record.known = replace(known, scores=replace(known.scores, arm_depth=depth))
+            record.is_complete = True
+            yield {}
 
     @kept(NEWEST, by=_around)
     def _record(self, method: Method, learned: Learned, frame: Frame) -> _Record:
@@ -147,20 +152,17 @@ class Comparison:
 
     @kept(NEWEST, by=lambda record, _, rollout: (record, rollout))
     def _arm(self, record: _Record, learned: Learned, rollout: int) -> ArmMotion:
-        known = record.known
-        assert known is not None
-        q, times = self._joints(known, learned, rollout), known.times[rollout]
-        if known.joints is None:
-            times = times[_tracked(len(times))]
+        assert record.known is not None
+        q, times = self._joints(record.known, learned, rollout)
         return ArmMotion(within_velocity_limits(times, q, self._follower.robot.velocity_limits), q, q)
 
-    def _joints(self, known: Compared, learned: Learned, rollout: int) -> Array:
-        """Postures (N, n), rad, along a rollout: planned, or tracking it from the demonstration's first posture."""
+    def _joints(self, known: Compared, learned: Learned, rollout: int) -> tuple[Array, Array]:
+        """Postures (N, n), rad, and times (N,), s, of a rollout: planned, or tracked from the demonstrated posture."""
+        times = known.times[rollout]
         if known.joints is not None:
-            return known.joints[rollout]
-        path = known.paths[rollout]
-        start = self._problem(learned).postures[rollout][0]
-        return track(self._follower.robot, path[_tracked(len(path))], start).q
+            return known.joints[rollout], times
+        at, start = np.unique(arm_samples(len(times))), self._problem(learned).postures[rollout][0]
+        return track(self._follower.robot, known.paths[rollout][at], start).q, times[at]
 
     def _arm_depth(self, known: Compared, frame: Frame, learned: Learned, cancelled: Cancelled) -> float | None:
         """How deep the arm's meshes enter the obstacle along motions, metres; None where it cannot follow."""
@@ -169,7 +171,7 @@ class Comparison:
             moving = np.flatnonzero(frame.motion.nominal.moving).tolist()
             for k in moving if ours else range(len(known.paths)):
                 end_if(cancelled)
-                q = arm_along(frame, k, self._follower)[0].q if ours else self._joints(known, learned, k)
+                q = arm_along(frame, k, self._follower)[0].q if ours else self._joints(known, learned, k)[0]
                 depth = max(depth, -model.nearest_to_obstacle(q, frame.scenario.obstacle).distance)
         except UnreachableError:
             return None
@@ -204,18 +206,13 @@ def curves(path: Array, demonstration: Array, obstacle: Union) -> Array:
     return np.column_stack([distance_from_path(even, demonstration), depth])
 
 
-def _tracked(num: int) -> Indices:
-    return np.unique(arm_samples(num))
-
-
 def _chosen(frame: Frame) -> list[Method]:
     """The methods that the view of a frame shows, ours first; none where it shows no others."""
-    others = [method for method in OTHERS if method.name in frame.scenario.view.compared]
+    others = chosen(frame.scenario.view, frame.task.name)
     return [OURS, *others] if others else []
 
 
 def _ours(frame: Frame) -> Compared:
-    """Our motions, those from the starts of the demonstrations that have one."""
     if frame.blocked:
         return Compared(OURS, note=frame.blocked[0].text)
     num = len(frame.task.starts)

@@ -19,22 +19,26 @@ from dt_viz.motion.nominal import Learned
 from dt_viz.motion.solve import Solved
 from dt_viz.motion.stack import Applied, cut_off
 from dt_viz.obstacles.union import Union
-from dt_viz.pictures.arm_field import Lattice
-from dt_viz.pictures.occupancy import occupancy_picture
 from dt_viz.pictures.panels import PanelPicture, generator_panel, system_panel
 from dt_viz.pictures.sketchbook import BASE_TITLE, Pictures, Sketchbook, in_frame
-from dt_viz.pictures.slice_fields import ARROW_SPACING, FieldPicture, arrows_and_colour, streamlines
-from dt_viz.robot.retiming import within_velocity_limits
+from dt_viz.pictures.slice_fields import (
+    ARROW_SPACING,
+    FieldPicture,
+    Lattice,
+    arrows_and_colour,
+    occupancy_picture,
+    streamlines,
+)
+from dt_viz.robot.joint_trajectory import within_velocity_limits
 from dt_viz.robot.robot import Robot
-from dt_viz.scenario.panels import BASE_PANEL, Panel, offsets
+from dt_viz.scenario.slices import BASE_PANEL, Panel, offsets
 from dt_viz.scenario.stack import IMITATION, levels
 from dt_viz.session.frame import Frame
 from dt_viz.warning import MotionWarning
 
 PLAIN_TITLE, AUGMENTED_TITLE = "plain: one field for all", "augmented: remembers its phase"
 """What is written over the two states, where they are side by side."""
-NUM_BOOKS = 8
-"""Number of learned motions whose pictures are kept."""
+NUM_BOOKS = 8  # number of learned motions whose pictures are kept
 
 
 def rollouts_of(motion: Solved, robot: Robot) -> DrawnSamples:
@@ -228,7 +232,6 @@ def _title(level: str) -> str:
 
 
 def _name(level: str) -> str:
-    """Name of a level within a line."""
     return level[:1].lower() + level[1:]
 
 

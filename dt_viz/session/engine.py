@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Hashable, Iterator, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from typing import TypeVar
 
@@ -11,28 +11,27 @@ import numpy as np
 
 from dt_viz.avoidance.avoidance import Avoidance
 from dt_viz.avoidance.passing import ANEW
-from dt_viz.checkpoints import checkpoint
-from dt_viz.errors import Cancelled, never
+from dt_viz.errors import Cancelled, DataError, never
 from dt_viz.learning.augmented import AugmentedImitation
 from dt_viz.learning.imitation import Progress
 from dt_viz.learning.store import FitStore
 from dt_viz.memo import Memo, kept
 from dt_viz.motion.certificates import Certificates, DrawnSamples
 from dt_viz.motion.following import NEWEST, Admission, ArmMotion, Follower, far_starts, unreachable
-from dt_viz.motion.learned import augmented_of, learned_of, styled
-from dt_viz.motion.nominal import Learned, Nominal, NominalTrajectory
+from dt_viz.motion.nominal import Learned, Nominal, NominalTrajectory, augmented_of, learned_of, styled
 from dt_viz.motion.profiles import profiles
 from dt_viz.motion.solve import Solved, solve, warped
 from dt_viz.motion.stack import FINE, LIVE, Precision
 from dt_viz.obstacles.shapes import TriangleObstacle
 from dt_viz.robot.inverse_kinematics import UnreachableError
 from dt_viz.robot.robot import Robot
-from dt_viz.scenario.panels import Panel
+from dt_viz.scenario.own import Own
 from dt_viz.scenario.scenario import Layer, Scenario, Start
+from dt_viz.scenario.slices import Panel
 from dt_viz.scenario.tasks import OWN, STYLES, Task, TaskEntry
+from dt_viz.scheduler import SCHEDULER, Rank, checkpoint
 from dt_viz.session.certify import certify, clearance, uncertified, with_meshes
 from dt_viz.session.comparison import Comparison
-from dt_viz.session.cores import CORES, Rank
 from dt_viz.session.drawing import Drawing, arm_along, rollouts_of
 from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.robot_loop import LiveArm
@@ -41,8 +40,7 @@ from dt_viz.warning import MotionWarning
 
 MOST_BEGINNINGS = 32
 """Largest number of motions, as tasks and scenes begin, that are kept for all visitors."""
-MOST_OWN = 4
-"""Largest number of a visitor's own tasks that are kept; the oldest go first."""
+MOST_OWN = 12  # largest number of a visitor's own tasks
 NOT_TURNED = "the arm does not get there with the hand turned as demonstrated: it follows the places alone"
 """Warning where orientations are left out."""
 
@@ -57,24 +55,30 @@ class Engine:
     """
 
     def __init__(
-        self, tasks: Mapping[str, TaskEntry], fits: FitStore, robot: Robot, shared: Memo | None = None
+        self,
+        tasks: Mapping[str, TaskEntry],
+        fits: FitStore,
+        robot: Robot,
+        shared: Memo | None = None,
+        name: str = "",
     ) -> None:
-        """Take what engines share: tasks, what was learned, the arm, and what no visitor's edits change, if any."""
-        self._tasks = tasks
+        """Take what engines share: tasks, what was learned, the arm, and what no visitor's edits change, if any.
+
+        `name` is that of the arm.
+        """
+        self._tasks, self._name = tasks, name
         self._fits = fits
         self.memo, self._shared = Memo(), Memo() if shared is None else shared
         """All other results that are kept."""
         self.follower = Follower(robot, self.memo, self._shared)
-        self.arm = LiveArm(self.follower)
-        """The arm in the loop."""
-        self.comparison = Comparison(self.follower, self.memo)
-        """Other methods beside ours."""
+        self.arm = LiveArm(self.follower)  # the arm in the loop
+        self.comparison = Comparison(self.follower, self.memo)  # other methods beside ours
         self._drawing = Drawing(self.follower, self.memo)
         self._last: dict[str, Solved] = {}
         """The last motion of each task: what is shown where a scenario has none."""
-        self.own: dict[str, tuple[Task, FitStore, Robot]] = {}
-        """Tasks of the visitor's own by name, the oldest first, what was learned from each, and the arm with which it
-        was opened: one dict, which the visitor's engines share and `bring` changes in place."""
+        self.own: dict[str, tuple[Task, FitStore, str]] = {}
+        """Tasks of the visitor's own by name, the oldest first, what was learned from each, and the name of the arm
+        with which it was opened: one dict, which the visitor's engines share and `bring` changes in place."""
 
     def title(self, name: str) -> str:
         """Title of the task of that name."""
@@ -91,28 +95,42 @@ class Engine:
     @kept(MOST_OWN)
     def _own_task(self, name: str) -> Task:
         task, _, opened_with = self.own[name]
-        robot = self.follower.robot
-        return task if robot is opened_with else where_followed(task, robot)
+        return task if self._name == opened_with else where_followed(task, self.follower.robot)
 
-    def bring(self, task: Task, shown: str) -> tuple[Task, str | None]:
-        """Take a task of the visitor's own, while another one is `shown`, which stays.
+    def bring(
+        self, task: Task, arm: str = "", number: int = 0, deleted: Collection[str] = ()
+    ) -> tuple[Task, str | None]:
+        """Take a task of the visitor's own, once if it comes again.
+
+        Args:
+            task: the task.
+            arm: name of the arm with which it was opened.
+            number: smallest number that it gets: no other task has had it.
+            deleted: names of own tasks that may go.
 
         Returns:
             The task with a name and a title of its own, and the name of the own task that had to go, if one had.
+
+        Raises:
+            DataError: there are `MOST_OWN`, none of which may go.
         """
-        number = max((int(name.rpartition("_")[2]) for name in self.own), default=0) + 1
+        made_from = Own.of(task).digest, task.layers, arm
+        for other, _, opened_with in self.own.values():
+            if (Own.of(other).digest, other.layers, opened_with) == made_from:
+                return other, None
+        oldest = next((name for name in self.own if name in deleted), None) if len(self.own) >= MOST_OWN else None
+        if oldest is None and len(self.own) >= MOST_OWN:
+            raise DataError("Your data", "tasks", f"{MOST_OWN} of yours", f"at most {MOST_OWN}: delete one first")
+        number = max(number, 1 + max((int(name.rpartition("_")[2]) for name in self.own), default=0))
         task = replace(task, name=f"{OWN}_{number}", title=f"Your data {number}" if number > 1 else "Your data")
-        oldest = next((name for name in self.own if name != shown), None) if len(self.own) >= MOST_OWN else None
-        self.own[task.name] = task, FitStore(None), self.follower.robot
+        self.own[task.name] = task, FitStore(None), arm
         if oldest is not None:
             del self.own[oldest]
         return task, oldest
 
-    @contextmanager
-    def refining(self, cancelled: Cancelled) -> Iterator[None]:
-        """Wait for a core, and have it, as what refines has: whoever drags comes first. Raises as `Cores.slot`."""
-        with CORES.slot(Rank.REFINEMENT, cancelled), CORES.short_turns():
-            yield
+    def refining(self, cancelled: Cancelled) -> AbstractContextManager[None]:
+        """Wait for the slot of a refinement, and have it within the block. Raises as `Scheduler.slot`."""
+        return SCHEDULER.slot(Rank.REFINEMENT, cancelled)
 
     def frames(
         self,
@@ -149,13 +167,13 @@ class Engine:
         learned = self._shown(scenario, learn)
         if steps:
             learn(1.0, "computing the motion; what is new to this processor is compiled, once")
-        rank = Rank.BEGINNING if scenario.passing is ANEW else Rank.HAND
-        with CORES.slot(rank):
+        rank = Rank.FIRST_PICTURE if scenario.passing is ANEW else Rank.DRAG
+        with SCHEDULER.slot(rank):
             scenario = newest(scenario)
             frame = self._rollouts(scenario, LIVE)
             draw(frame)
         yield frame
-        with CORES.slot(rank):
+        with SCHEDULER.slot(rank):
             frame = self._seen(frame, Stage.LIVE, learned)
             draw(frame)
         yield frame
@@ -163,13 +181,13 @@ class Engine:
         yield frame
         frame = replace(frame, stage=Stage.CERTIFIED)
         if not frame.blocked:
-            with CORES.slot(Rank.REFINEMENT, cancelled):
+            with self.refining(cancelled):
                 frame = replace(frame, certificates=self._certified(frame))
-            with CORES.slot(Rank.REFINEMENT, cancelled):
+            with self.refining(cancelled):
                 frame = replace(frame, certificates=self._certified_with_meshes(frame))
         yield frame
         if frame.motion.arm is not None and not frame.blocked:
-            with CORES.slot(Rank.REFINEMENT, cancelled):
+            with self.refining(cancelled):
                 self.follower.reference_postures(frame.motion.nominal.learned)  # a drag may need them at once
         yield from self._compared_at_rest(frame, cancelled)
 
@@ -182,9 +200,9 @@ class Engine:
             self._last = last
 
     def _fine(self, scenario: Scenario, others: Mapping[Panel, Learned], cancelled: Cancelled) -> Frame:
-        with CORES.slot(Rank.REFINEMENT, cancelled):
+        with self.refining(cancelled):
             frame = self._rollouts(scenario, FINE)
-        with CORES.slot(Rank.REFINEMENT, cancelled):
+        with self.refining(cancelled):
             return self._seen(frame, Stage.FINE, others)
 
     def _shown(self, scenario: Scenario, progress: Progress | None = None) -> Mapping[Panel, Learned]:
@@ -222,8 +240,7 @@ class Engine:
         return self._learn(scenario, self.own[scenario.task][1], progress)
 
     def _learn(self, scenario: Scenario, fits: FitStore, progress: Progress | None) -> Learned:
-        with CORES.short_turns():
-            learned = learned_of(scenario, self.task(scenario.task), fits, progress)
+        learned = learned_of(scenario, self.task(scenario.task), fits, progress)
         imitation = learned.imitation
         if isinstance(imitation, AugmentedImitation) and learned.poses and self.follower.unreached(learned):
             places = replace(imitation, goal_orientation=None, warnings=(*imitation.warnings, NOT_TURNED))
@@ -381,7 +398,7 @@ class Engine:
 
         left = self.comparison.complete(frame, self._plain(frame.scenario), asked)
         while True:
-            with CORES.slot(Rank.REFINEMENT, cancelled):
+            with self.refining(cancelled):
                 notes = next(left, None)
                 if notes is None:
                     return

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
-from functools import cached_property
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from dt_viz.baselines.base import Method
 from dt_viz.flows.diffeomorphisms import Flow
 from dt_viz.flows.fields import Array, Mask
 from dt_viz.flows.rotations import rotation
+from dt_viz.memo import cached_property
 from dt_viz.metrics import arc_length
 from dt_viz.motion.certificates import Certificates, DrawnSamples
 from dt_viz.motion.following import ArmMotion
@@ -30,12 +30,10 @@ from dt_viz.warning import MotionWarning
 class Stage(IntEnum):
     """How far a frame is worked out; each stage holds all that the one before it holds."""
 
-    ROLLOUTS = 0
-    """Rollouts and their clearance."""
+    ROLLOUTS = 0  # rollouts and their clearance
     LIVE = 1
     """Also what lies on the slice, and the arm's motion if it is shown: what follows a drag."""
-    FINE = 2
-    """All of it refined, for a scenario that rests."""
+    FINE = 2  # all of it refined, for a scenario that rests
     CERTIFIED = 3
     """Also the certificates. Where methods are compared, more frames of this stage follow, each of which tells more of
     them."""
@@ -47,10 +45,8 @@ class Scores:
 
     frechet: float
     """Mean over the starts of the discrete Fréchet distance to the demonstration, metres."""
-    hand_depth: float
-    """Maximum collision distance of the end effector, metres; 0 when it is clear."""
-    goal_error: float
-    """Largest distance of a motion's end from the goal, metres."""
+    hand_depth: float  # maximum collision distance of the end effector, metres; 0 when it is clear
+    goal_error: float  # largest distance of a motion's end from the goal, metres
     arm_depth: float | None = None
     """Maximum collision distance of the arm's meshes, metres; None where it is not known yet."""
 
@@ -62,20 +58,16 @@ class Compared:
     method: Method
     paths: tuple[Array, ...] = ()
     """(N_i, 3) of the end effector, metres; none where there are no motions."""
-    times: tuple[Array, ...] = ()
-    """(N_i,) of their samples, seconds."""
-    joints: tuple[Array, ...] | None = None
-    """(N_i, n) of the arm, rad, where the method plans them."""
+    times: tuple[Array, ...] = ()  # (N_i,) of their samples, seconds
+    joints: tuple[Array, ...] | None = None  # (N_i, n) of the arm, rad, where the method plans them
     scores: Scores | None = None
-    note: str = ""
-    """What the motions fail at, or why there are none."""
+    note: str = ""  # what the motions fail at, or why there are none
     rollout: int = 0
     """Number of one motion: the one that the arm follows where that begins at a demonstrated start."""
     curves: Array | None = None
     """(`dt_viz.motion.profiles.NUM_SAMPLES`, 2) of that one, at even distances along it, metres: distance to the
     demonstration, and depth in the obstacle."""
-    arm: ArmMotion | None = None
-    """The arm along that motion, where the view shows it."""
+    arm: ArmMotion | None = None  # the arm along that motion, where the view shows it
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,13 +76,11 @@ class Frame:
 
     scenario: Scenario
     stage: Stage
-    motion: Solved
-    """The scenario's motion, or where it has none the last one that its task had."""
+    motion: Solved  # the scenario's motion, or where it has none the last one that its task had
     drawn: DrawnSamples
     """Its rollouts, by the places of their starts: first the task's, then added ones."""
     certificates: Certificates
-    blocked: tuple[MotionWarning, ...] = ()
-    """Why there is no motion for this scenario."""
+    blocked: tuple[MotionWarning, ...] = ()  # why there is no motion for this scenario
     arm: ArmMotion | None = None
     """None before stage FINE, at LIVE only unless the view shows it, and where the arm cannot reach the start."""
     pictures: Pictures = NO_PICTURES

@@ -12,9 +12,9 @@ import numpy as np
 
 from dt_viz.errors import Cancelled, FormatError, never, parsing
 from dt_viz.files.columns import UNITS
+from dt_viz.files.reading import read_upload
 from dt_viz.files.recordings import Answers, Recordings
 from dt_viz.files.takes import UNTIMED, Take, in_si_units
-from dt_viz.files.uploads import read_upload
 from dt_viz.flows.fields import Array
 from dt_viz.learning.demonstrations import Demonstration, DemonstrationError, demonstrations_of
 from dt_viz.learning.inspection import Inspection, PreparationSettings
@@ -43,12 +43,9 @@ class Choices:
 
     unit: str = ""
     """Unit of lengths, of `LENGTHS`, where files do not say it; empty where it is recognised."""
-    rate: float | None = None
-    """Samples a second of takes without times, Hz; None is guessed."""
-    left_out: frozenset[int] = frozenset()
-    """Numbers of takes that are left out by choice."""
-    goal: int = 0
-    """Number of the goal, where the takes have several."""
+    rate: float | None = None  # samples a second of takes without times, Hz; None is guessed
+    left_out: frozenset[int] = frozenset()  # numbers of takes that are left out by choice
+    goal: int = 0  # number of the goal, where the takes have several
     preparation: PreparationSettings = field(default_factory=PreparationSettings)
     """What is done to takes."""
     fits_reach: bool = False
@@ -59,21 +56,16 @@ class Choices:
 class Opened:
     """What a visitor has opened, and taught."""
 
-    files: tuple[tuple[str, bytes], ...] = ()
-    """Names and contents."""
+    files: tuple[tuple[str, bytes], ...] = ()  # names and contents
     answers: Mapping[str, Any] = field(default_factory=dict)
     """What was answered to the files' questions, by what these are about."""
-    recordings: Recordings = field(default_factory=Recordings)
-    """What was read of the files."""
-    num_read: int = 0
-    """Number of files of which they were read."""
+    recordings: Recordings = field(default_factory=Recordings)  # what was read of the files
+    num_read: int = 0  # number of files of which they were read
     choices: Choices = field(default_factory=Choices)
     taught: tuple[Taught, ...] = ()
     """Takes that were taught in the page; they come after those of files."""
-    past: tuple[Lesson, ...] = ()
-    """What was taught before each step to undo, the last one last."""
-    future: tuple[Lesson, ...] = ()
-    """What was taught after each step to redo, the next one last."""
+    past: tuple[Lesson, ...] = ()  # what was taught before each step to undo, the last one last
+    future: tuple[Lesson, ...] = ()  # what was taught after each step to redo, the next one last
 
     @classmethod
     def again(cls, lesson: Lesson, preparation: PreparationSettings | None = None) -> Opened:
@@ -132,40 +124,29 @@ class SeenTake:
     """One take, and what becomes of it."""
 
     inspection: Inspection
-    given: Array
-    """(T, 3) positions as they were recorded, placed, metres."""
+    given: Array  # (T, 3) positions as they were recorded, placed, metres
     learned: Array | None
     """(S, 3) positions that are learned from, placed, metres; None where it is left out."""
-    is_chosen: bool
-    """Whether the visitor has not left it out."""
-    is_far: bool = False
-    """Whether the arm cannot follow it."""
+    is_chosen: bool  # whether the visitor has not left it out
+    is_far: bool = False  # whether the arm cannot follow it
 
 
 @dataclass(frozen=True, eq=False)
 class Preview:
     """What would be learned of takes."""
 
-    takes: tuple[SeenTake, ...]
-    """All of them, in their order."""
+    takes: tuple[SeenTake, ...]  # all of them, in their order
     task: Task | None = None
     """The task of those that are learned from, placed; None where nothing can be learned."""
-    goal: Array | None = None
-    """(3,) its goal, metres."""
-    goals: tuple[str, ...] = ()
-    """The goals, if there are several: what ends there, and where."""
-    goal_number: int = 0
-    """Number of the one that is learned."""
-    unit: str = ""
-    """Unit of lengths that is asked for; empty if it is clear."""
-    rate: float | None = None
-    """Rate that is asked for, Hz; None if the files say it."""
+    goal: Array | None = None  # (3,) its goal, metres
+    goals: tuple[str, ...] = ()  # the goals, if there are several: what ends there, and where
+    goal_number: int = 0  # number of the one that is learned
+    unit: str = ""  # unit of lengths that is asked for; empty if it is clear
+    rate: float | None = None  # rate that is asked for, Hz; None if the files say it
     notes: tuple[str, ...] = ()
     """What is to be known about the files, and about takes that cannot be used."""
-    reach: str = ""
-    """What is out of the arm's reach, and what would fit; empty if nothing is."""
-    problem: str = ""
-    """Why nothing can be learned."""
+    reach: str = ""  # what is out of the arm's reach, and what would fit; empty if nothing is
+    problem: str = ""  # why nothing can be learned
     drawn: tuple[Array, ...] = ()
     """Places (N_i, 3) of the pointer in takes that were taught, metres."""
     beyond: tuple[Array, ...] = ()

@@ -9,8 +9,7 @@ from typing import Any
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.session.session import Session
 
-STEP = 0.05
-"""Interval of the edits, seconds, as of a dragged slider."""
+STEP = 0.05  # interval of the edits, seconds, as of a dragged slider
 LANE = "player"
 """Lane of the session's jobs on which one thing is played at a time, the one that was started last."""
 
@@ -40,7 +39,7 @@ def start(
             if changes is not None:
                 session.edit(gesture, **changes)
                 mine = session.scenario
-                session.jobs.rest(LANE, STEP)
+                session.jobs.rest(STEP, LANE)
             if changes is None or session.jobs.superseded(LANE):
                 if returns:
                     session.edit(gesture, stack=before.stack)

@@ -23,14 +23,10 @@ take with what they wait for: these are drawn more often, the more so the longer
 class Pace:
     """How rebuilding goes."""
 
-    latency: float
-    """Time from the last edit until its live frame was ready, seconds."""
-    rate: float
-    """Live frames in the last second."""
-    num_skipped: int
-    """Edits that a newer one overtook, since the session began."""
-    num_edits: int = 0
-    """Edits that were computed or overtaken since then."""
+    latency: float  # time from the last edit until its live frame was ready, seconds
+    rate: float  # live frames in the last second
+    num_skipped: int  # edits that a newer one overtook, since the session began
+    num_edits: int = 0  # edits that were computed or overtaken since the last frame
 
 
 READ = 30.0
@@ -43,10 +39,8 @@ class Message:
 
     text: str
     severity: Severity
-    scenario: Scenario
-    """The scenario that was wanted when it came."""
-    came: float = 0.0
-    """When that was, seconds, of `time.monotonic`."""
+    scenario: Scenario  # the scenario that was wanted when it came
+    came: float = 0.0  # when that was, seconds, of `time.monotonic`
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,11 +48,9 @@ class Progress:
     """How what is shown relates to what is wanted."""
 
     wanted: Scenario
-    shown: Frame | None = None
-    """The frame that is shown; None before the first one."""
+    shown: Frame | None = None  # the frame that is shown; None before the first one
     pace: Pace = Pace(0.0, 0.0, 0)
-    expected: bool = False
-    """Whether another task or scene is being read."""
+    expected: bool = False  # whether another task or scene is being read
     learning: tuple[float, str] | None = None
     """Fraction of the learning that is done, and name of its step; None while nothing is learned."""
     failed: bool = False
@@ -66,8 +58,7 @@ class Progress:
     message: Message | None = None
     restored: Scenario | None = None
     """The saved scenario that the page began or went on with, of the browser, a file or the server; None if none."""
-    steps: tuple[bool, bool] = (False, False)
-    """Whether there is something to undo, and to redo."""
+    steps: tuple[bool, bool] = (False, False)  # whether there is something to undo, and to redo
     beside: tuple[bool, bool] | None = None
     """The same of what is open beside the scenario; None if nothing is."""
 
@@ -83,17 +74,6 @@ class Progress:
         shown = self.shown
         certified = shown is not None and shown.stage is Stage.CERTIFIED and self.wanted.computes_like(shown.scenario)
         return certified and not self.stale
-
-
-@dataclass
-class Edits:
-    """Edits that need frames."""
-
-    number: int = 0
-    num_skipped: int = 0
-    """Number of those that a newer one overtook."""
-    newest: float = 0.0
-    """Time of the newest, of `time.perf_counter`."""
 
 
 class Display(Protocol):
@@ -116,8 +96,9 @@ class Screen:
         self._display = display
         self._adopting, self._telling = threading.RLock(), threading.RLock()
         self.progress = Progress(wanted, restored=restored)
-        self._pace = self.progress.pace
-        """Of the newest frame."""
+        self._pace, self._num_shown = self.progress.pace, 0  # of the newest frame: pace, and number of edits until then
+        self.num_edits, self.num_skipped = 0, 0  # that need frames, and those of them that a newer one overtook
+        self.edited = 0.0  # time of the newest, of `time.perf_counter`
         self._live_frames: deque[float] = deque(maxlen=120)
         """Times of the newest frames of stage LIVE, of `time.perf_counter`."""
 
@@ -146,7 +127,7 @@ class Screen:
                 if message is not None and now - message.came >= READ and not self.progress.failed:
                     self.tell(message=None)
 
-    def draw(self, frame: Frame, edited: float, num_skipped: int, num_edits: int) -> None:
+    def draw(self, frame: Frame, edited: float) -> None:
         """Show a frame whose scenario was asked for at a time, of `time.perf_counter`; learning is no rebuild."""
         now = time.perf_counter()
         if frame.stage is Stage.LIVE:
@@ -154,7 +135,8 @@ class Screen:
         rate = sum(now - t <= 1.0 for t in self._live_frames)
         is_rebuilt = frame.stage <= Stage.LIVE and self.progress.learning is None
         latency = now - edited if is_rebuilt else self._pace.latency
-        self._pace = Pace(latency, rate, num_skipped, num_edits)
+        num_new, self._num_shown = self.num_edits - self._num_shown, self.num_edits
+        self._pace = Pace(latency, rate, self.num_skipped, num_new)
         self._display.draw(frame, self._pace)
         if frame.stage is not Stage.ROLLOUTS:  # the next stage is a few milliseconds away
             with self._telling:

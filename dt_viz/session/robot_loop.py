@@ -14,27 +14,23 @@ from dt_viz.flows.fields import Array
 from dt_viz.motion.following import Follower
 from dt_viz.motion.solve import Solved
 from dt_viz.robot.inverse_kinematics import track
-from dt_viz.robot.sizing import scales, sized
+from dt_viz.robot.robot import scales, sized
 
 
 @dataclass(frozen=True)
 class RoundSettings:
     """Settings of `LiveArm`."""
 
-    tick: float = 0.01
-    """Shortest time from one tick of the controller to the next, seconds: 100 Hz."""
+    tick: float = 0.01  # shortest time from one tick of the controller to the next, seconds: 100 Hz
     most: int = 5
     """Number of ticks at once, at most: they are longer where the robot's thread is late."""
     most_calm: int = 2
     """The same while nothing but the robot moves, so that nothing is to be reacted to."""
     longest: float = 0.25
     """Longest time that the robot moves at once, seconds: a thread that was held up does not make it rush."""
-    rest: float = 0.8
-    """Time that the robot stays at the goal before it goes home, seconds."""
-    rest_aside: float = 3.0
-    """The same where it has stepped aside, seconds."""
-    rest_at_start: float = 0.3
-    """Time that the robot stays at a start, seconds."""
+    rest: float = 0.8  # time that the robot stays at the goal before it goes home, seconds
+    rest_aside: float = 3.0  # the same where it has stepped aside, seconds
+    rest_at_start: float = 0.3  # time that the robot stays at a start, seconds
     push_distance: float = scales(0.06)
     """Distance by which the hand is pushed, metres, for an arm as large as the JACO."""
     place_tolerance: float = 0.01
@@ -45,12 +41,9 @@ class RoundSettings:
 class _Round:
     """Where in its round a robot is."""
 
-    start: int = 0
-    """Place of the start of this round, or of the next one while it goes there."""
-    rested: float = 0.0
-    """Time since it came to rest, seconds."""
-    arrived: float = 0.0
-    """See `LiveArm.arrived`."""
+    start: int = 0  # place of the start of this round, or of the next one while it goes there
+    rested: float = 0.0  # time since it came to rest, seconds
+    arrived: float = 0.0  # see `LiveArm.arrived`
 
 
 class LiveArm:
@@ -67,11 +60,9 @@ class LiveArm:
         """Commands for the thread that moves the robot, by what they are about; the newest of a kind counts."""
         self._controller: ArmController | None = None
         self._solved: Solved | None = None
-        self._chosen: int | None = None
-        """Number of the start that was chosen."""
+        self._chosen: int | None = None  # number of the start that was chosen
         self._q: Array | None = None
-        self._held: Array | None = None
-        """(3,) where the hand is to be held, metres."""
+        self._held: Array | None = None  # (3,) where the hand is to be held, metres
         self._round, self._due = _Round(), 0.0
         self._rng = np.random.default_rng(0)
 

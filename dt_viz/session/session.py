@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from dt_viz.accounts import Account
 from dt_viz.avoidance.passing import ANEW
 from dt_viz.errors import DataError, UnwantedError, end_if
 from dt_viz.learning.imitation import ImitationError
@@ -20,13 +19,12 @@ from dt_viz.scenario.relocation import changes_of_place, relocated
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import IMITATION, as_fresh
 from dt_viz.scenario.tasks import Task
+from dt_viz.scheduler import Jobs
 from dt_viz.session.arms import Engines, NewEngine
-from dt_viz.session.cores import CORES
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Frame, Stage
-from dt_viz.session.history import Beside, History
-from dt_viz.session.jobs import Jobs
-from dt_viz.session.progress import Display, Edits, Screen
+from dt_viz.session.history import NO_CAMERA, Beside, Camera, History, Step
+from dt_viz.session.progress import Display, Screen
 from dt_viz.warning import Severity
 
 HABITS = ("playing", "replay", "speed", "joint_plots", "health_plots", "large_plots")
@@ -56,7 +54,6 @@ class Session:
         display: Display,
         new_engine: NewEngine | None = None,
         restored: Scenario | None = None,
-        account: Account | None = None,
     ) -> None:
         """Start with a task.
 
@@ -67,10 +64,8 @@ class Session:
             display: where results go.
             new_engine: makes engines for other arms; None if there are none.
             restored: scenario of the first arm to start with instead, if any; see also `restore`.
-            account: charged for processor time; None if nobody counts it.
         """
-        self.engines = Engines(engine, new_engine)
-        """Engines of this session, by its arms."""
+        self.engines = Engines(engine, new_engine)  # engines of this session, by its arms
         self._initial = initial
         self._lock = threading.Lock()
         self.scenario = initial(engine, task) if restored is None else restored
@@ -80,13 +75,9 @@ class Session:
         """Whether the scenario was edited by a drag and is not shown on the controls yet."""
         self._stopped = False
         """Whether the learning of the scenario was cancelled, and there is no other to go back to."""
-        self._shown: Frame | None = None
-        """The newest frame; None before the first one."""
-        self._edits = Edits()
-        self._computed = self.scenario
-        """Scenario that is computed now, or was last."""
-        self.jobs = Jobs(self.fail, account, CORES.wake, CORES.give_way)
-        """All work of the visitor beside the server's event loop."""
+        self._shown: Frame | None = None  # the newest frame; None before the first one
+        self._computed = self.scenario  # scenario that is computed now, or was last
+        self.jobs = Jobs(self.fail)  # all work of the visitor beside the server's event loop
         self._adopt()
         self._submit()
 
@@ -94,6 +85,12 @@ class Session:
     def engine(self) -> Engine:
         """The engine for the scenario's arm."""
         return self.engines(self.scenario.arm)
+
+    @property
+    def taught(self) -> Mapping[str, tuple[Task, str]]:
+        """The visitor's own tasks in the list by name, each with the name of the arm with which it was opened."""
+        own = [*self.engine.own.items()]
+        return {name: (task, arm) for name, (task, _, arm) in own if name not in self.engines.deleted}
 
     @property
     def robot(self) -> Robot:
@@ -105,20 +102,27 @@ class Session:
         """The scenario's task. Raises what `Engine.task` raises."""
         return self.engine.task(self.scenario.task)
 
-    def edit(self, gesture: str, *, anew: bool = False, **changes: Any) -> None:  # noqa: ANN401 - the fields of Scenario
+    def edit(
+        self,
+        gesture: str,
+        *,
+        anew: bool = False,
+        camera: Camera | None = None,
+        **changes: Any,  # noqa: ANN401 - the fields of Scenario
+    ) -> None:
         """Replace fields of the scenario, all but `passing`, and have it computed anew.
 
         Edits by one gesture in quick succession are undone together. Detours and reference posture are those of the
-        motion that is shown, or chosen `anew`.
+        motion that is shown, or chosen `anew`. With a `camera`, undo brings back the view and the camera, too.
         """
         with self._lock:
             edited = _with_a_level_of_its_own(replace(self.scenario, **changes))
-            failed = self._screen.progress.failed
-            if edited == self.scenario and not failed:
+            failed, moved = self._screen.progress.failed, camera is not None and camera.chosen() is not None
+            if edited == self.scenario and not failed and not moved:
                 return
             if edited.full != self.scenario.full:
                 edited = replace(edited, passing=ANEW if anew else None)
-            self._history.edited(gesture, self.scenario, edited)
+            self._history.edited(gesture, self.scenario, edited, camera)
             needs_frames = failed or not edited.computes_like(self.scenario)
             self.scenario = edited
             if needs_frames:
@@ -167,14 +171,31 @@ class Session:
         """Begin with a task as it begins, seen as what is shown now; can be undone. Raises as `choose_task`."""
         self._begin("task", self._as_seen(self._initial(self.engine, name)))
 
-    def bring(self, task: Task, arm: str | None = None) -> tuple[Task, str | None]:
-        """Take a visitor's own task, of an arm or the present one; see `Engine.bring`. Raises as `choose_arm`."""
-        engine, _ = self._task_of(self.scenario.arm if arm is None else arm, self.scenario.task)
-        own, gone = engine.bring(task, self.scenario.task)
-        if gone is not None:
-            with self._lock:
+    def bring(self, task: Task, arm: str | None = None, number: int = 0) -> Task:
+        """Take a visitor's own task into the list of tasks, where it stays until it is deleted; see `Engine.bring`.
+
+        It was opened with an arm, or the present one.
+
+        Raises:
+            DataError: there are as many as there may be.
+        """
+        engine = self.engine
+        with self._lock:
+            own, gone = engine.bring(task, self.scenario.arm if arm is None else arm, number, self.engines.deleted)
+            self.engines.deleted -= {own.name, gone}
+            if gone is not None:
                 self._history.forget(gone)
-        return own, gone
+        self._adopt()
+        return own
+
+    def delete(self, name: str, instead: str) -> None:
+        """Take an own task out of the list, and begin another one `instead`; undo brings it back.
+
+        Raises as `choose_task`.
+        """
+        self.choose_task(instead)
+        self.engines.deleted.add(name)
+        self._adopt()
 
     def choose_arm(self, name: str) -> None:
         """Go on with another arm, and all that is there where the task is in its reach; called on the lane `CHOICES`.
@@ -218,11 +239,11 @@ class Session:
         finally:
             self._screen.tell(learning=None)
 
-    def reset(self) -> None:
-        """Back to how the task or the scene began, and was looked at; the motion's part of it can be undone."""
+    def reset(self, camera: Camera = NO_CAMERA) -> None:
+        """Back to how the task or the scene began, and was looked at, by a `camera`, too; all of it can be undone."""
         scene = SCENES.get(self.scenario.scene)
         fresh = self._initial(self.engine, self.scenario.task) if scene is None else scene.scenario(self.task)
-        self._begin("reset", fresh)
+        self._begin("reset", fresh, camera=camera)
 
     def leave_scene(self) -> None:
         """Back to how the task of the scene begins; can be undone. Nothing is done while there is no scene."""
@@ -252,7 +273,12 @@ class Session:
 
     def come_back(self) -> None:
         """Go on with the scenario that `visit` set aside, and its history, as if nothing had been since."""
-        self._travel(lambda _present: self._history.taken_back())
+
+        def taken_back(_present: Scenario) -> Step | None:
+            own = self._history.taken_back()
+            return own and Step(own)
+
+        self._travel(taken_back)
 
     @property
     def own(self) -> Scenario:
@@ -343,19 +369,27 @@ class Session:
         """Stop computing and let go of everything."""
         self.jobs.close()
 
-    def _travel(self, moved: Callable[[Scenario], Scenario | None], *, seen: bool = False) -> None:
-        """Go to the scenario that the present one is `moved` to, if any; `seen` as what is shown now."""
+    def _travel(self, moved: Callable[[Scenario], Step | None], *, seen: bool = False) -> None:
+        """Go to the step that the present scenario is `moved` to, if any; `seen` as what is shown now, or as it was."""
         with self._lock:
             there = moved(self.scenario)
             if there is None:
                 return
-            self.scenario = self._as_seen(there) if seen else there
+            self.scenario = self._as_seen(there.scenario) if seen and there.camera is None else there.scenario
             self._submit()
+        if there.camera is not None:
+            there.camera.put_back(there.pose)
         self._adopt()
 
     def _adopt(self) -> None:
         self._unadopted = False
-        self._screen.adopt(lambda: (self.scenario, self._history.steps))
+        self._screen.adopt(self._wanted)
+
+    def _wanted(self) -> tuple[Scenario, tuple[bool, bool]]:
+        """The scenario, whose task is in the list again if it was deleted, and whether there are steps."""
+        wanted = self.scenario
+        self.engines.deleted.discard(wanted.task)
+        return wanted, self._history.steps
 
     def _catch_up(self) -> None:
         if self._unadopted:
@@ -380,10 +414,10 @@ class Session:
         engine = self.engines.get(self.scenario.arm)
         if engine is not None:
             engine.see(self.scenario)
-        self._edits.number += 1
-        self._edits.newest = time.perf_counter()
-        work = partial(self._compute, self.scenario, self._edits.newest)
-        self._edits.num_skipped += self.jobs.submit(LANE, work, latest=True)
+        self._screen.num_edits += 1
+        self._screen.edited = time.perf_counter()
+        work = partial(self._compute, self.scenario, self._screen.edited)
+        self._screen.num_skipped += self.jobs.submit(LANE, work, latest=True)
 
     def _compute(self, scenario: Scenario, edited: float) -> None:
         """Show the frames of a scenario that was wanted at a time, of `time.perf_counter`."""
@@ -436,8 +470,8 @@ class Session:
                 newest = self.scenario
                 if replace(newest, stack=before.stack, passing=before.passing) != before or newest == before:
                     return before
-                self._computed, edited = newest, self._edits.newest
-                self._edits.num_skipped += self.jobs.drop(LANE)
+                self._computed, edited = newest, self._screen.edited
+                self._screen.num_skipped += self.jobs.drop(LANE)
             return self._decided(newest)
 
         def draw(frame: Frame) -> None:
@@ -446,7 +480,7 @@ class Session:
             self._shown, pause = frame, 0.0
             if frame.stage is Stage.ROLLOUTS and drawn:
                 return  # it is only looked at in another way: the next stage is what changes
-            self._screen.draw(frame, edited, self._edits.num_skipped, self._edits.number)
+            self._screen.draw(frame, edited)
             if frame.stage in (Stage.ROLLOUTS, Stage.FINE):
                 engine.drive(frame)
             if frame.stage is Stage.ROLLOUTS:
@@ -458,6 +492,6 @@ class Session:
             if frame.stage > Stage.LIVE:
                 draw(frame)
             else:
-                self.jobs.rest(LANE, REST if frame.stage is Stage.LIVE else pause)
+                self.jobs.rest(REST if frame.stage is Stage.LIVE else pause, LANE)
             if superseded():
                 return

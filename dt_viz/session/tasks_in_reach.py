@@ -13,7 +13,7 @@ from dt_viz.numerics import unit
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.inverse_kinematics import UnreachableError, inverse_kinematics
-from dt_viz.robot.placement import PlacementSettings, follows, is_jaco, place, resampled
+from dt_viz.robot.placement import NUM_SAMPLES, follows, is_jaco, place, resampled
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.tasks import Task, TaskEntry
 
@@ -37,7 +37,7 @@ def in_reach(tasks: Mapping[str, TaskEntry], robot: Robot, *, moves_recorded: bo
 
 def where_followed(task: Task, robot: Robot) -> Task:
     """Return a task where it was recorded if the arm follows it there, or else placed in its reach."""
-    paths = np.array([resampled(path, PlacementSettings.num_samples) for path in task.paths])
+    paths = np.array([resampled(path, NUM_SAMPLES) for path in task.paths])
     return task if follows(robot, paths) else _placed(task, robot)
 
 

@@ -26,20 +26,15 @@ class TeachingSettings:
 
     interval: float = 0.05
     """Time between two points that a page sends while the pointer moves, seconds."""
-    closest: float = 0.002
-    """Time in which points arrived together, seconds: the last one counts."""
-    standing: float = 0.15
-    """Time without a point from which on the pointer stood still, seconds."""
+    closest: float = 0.002  # time in which points arrived together, seconds: the last one counts
+    standing: float = 0.15  # time without a point from which on the pointer stood still, seconds
     most_points: int = 300
     """Largest number of points that a spline is fitted to; of more, evenly chosen ones are used, which is said."""
     most_recorded: int = 4096
     """Number of points at which every second one of a take that is still being made is dropped."""
-    least_points: int = 5
-    """Smallest number of points of a take."""
-    shortest: float = 0.02
-    """Smallest length of a take, metres."""
-    rate: float = 50.0
-    """Samples a second of a take that is kept, Hz."""
+    least_points: int = 5  # smallest number of points of a take
+    shortest: float = 0.02  # smallest length of a take, metres
+    rate: float = 50.0  # samples a second of a take that is kept, Hz
     penalty: float = 1.4
     """Weight of the degrees of freedom in generalised cross-validation; above 1 fewer splines follow noise."""
     board: tuple[float, float] = (0.32, 0.28)
@@ -58,12 +53,9 @@ SETTINGS = TeachingSettings()
 class Stroke:
     """Points of one take, as they arrive; strokes that are continued count no time in between."""
 
-    moments: list[float] = field(default_factory=list)
-    """Times of the points, seconds."""
-    places: list[Array] = field(default_factory=list)
-    """Points (3,), metres."""
-    lifted: float = 0.0
-    """Time that has passed without the pen, seconds."""
+    moments: list[float] = field(default_factory=list)  # times of the points, seconds
+    places: list[Array] = field(default_factory=list)  # points (3,), metres
+    lifted: float = 0.0  # time that has passed without the pen, seconds
 
     def add(self, moment: float, place: Array, *, begins: bool = False) -> None:
         """Take a point (3,), metres, at a moment, seconds; where a stroke `begins` again, the pen was up before."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,26 +16,81 @@ from dt_viz.session import player
 from dt_viz.session.frame import Frame
 from dt_viz.session.player import Play
 from dt_viz.session.session import Session
-from dt_viz.ui.controls import Control, on_command
+from dt_viz.ui import patches
 
-KEEP: Any = object()
-"""Value of a binding that leaves what is shown as it is."""
+KEEP: Any = object()  # value of a binding that leaves what is shown as it is
 EDITS = "edits"
 """Lane of the session's jobs for edits that take longer than the server's event loop may wait."""
 STOP = "Stop"
-Handle = Value = Any
-"""Handles of viser, and values of inputs, of all kinds."""
+Handle = Value = Any  # handles of viser, and values of inputs, of all kinds
 Act = Callable[[Session, Value], object]
 Read = Callable[[Scenario], Value]
 """Function of the adopted scenario; it may look at `Bindings.frame`, too."""
+
+
+class Control:
+    """An input of the panel, with the value that was shown last, or accepted from the browser since.
+
+    viser accepts any claim of a browser, also for inputs that are disabled or hidden, and calls back afterwards. A
+    number beyond the limits is moved to them. Anything else that the input cannot have sent is refused, and the
+    browser is shown the previous value.
+    """
+
+    def __init__(self, handle: Handle, act: Callable[[Value], object] = lambda _value: None) -> None:
+        """Take over an input of viser; `act`, which must only submit, is called with each allowed value."""
+        self.handle, self.act = handle, act
+        self._value, self._is_button = handle.value, hasattr(handle, "on_click")
+        (handle.on_click if self._is_button else handle.on_update)(self._changed)
+
+    @property
+    def value(self) -> Value:
+        """Value shown last, or accepted from the browser since; assigning shows another one."""
+        return self._value
+
+    @value.setter
+    def value(self, value: Value) -> None:
+        self._value = value
+        if self.handle.value != value:
+            self._put_back()
+
+    async def _changed(self, event: viser.GuiEvent) -> None:
+        if event.client is None:  # assigned here, not in a browser
+            return
+        claimed = self.handle.value
+        value = allowed(self.handle, claimed)
+        self._value = self._value if value is None else value
+        if claimed != self._value:
+            self._put_back()
+        if value is not None:
+            self.act(value)
+
+    def switch(self) -> None:
+        """Do as the visitor who presses this checkbox."""
+        self.value = not self.value
+        self.act(self.value)
+
+    def _put_back(self) -> None:
+        patches.put_back(self.handle, self._value, shown=not self._is_button)
+
+
+def allowed(handle: Handle, claimed: Value) -> Value | None:
+    """Return the value that an input takes for a claim; None if its browser cannot have sent it.
+
+    viser has converted the claim to the type of the input's value, unless it is a file, which any input may be sent.
+    """
+    if handle.disabled or not handle.visible or isinstance(claimed, viser.UploadedFile):
+        return None
+    if isinstance(handle, viser.GuiSliderHandle):
+        finite = -math.inf < claimed < math.inf
+        return type(claimed)(min(max(claimed, handle.min), handle.max)) if finite else None
+    return claimed if claimed in getattr(handle, "options", (claimed,)) else None
 
 
 @dataclass
 class _Binding:
     read: Read
     put: Callable[[Any], None]
-    last: Any = KEEP
-    """Value that was read last."""
+    last: Any = KEEP  # value that was read last
     of_frame: bool = False
     """Whether a frame was looked at for it, so that the next one may change it."""
 
@@ -48,11 +104,9 @@ class Bindings:
     """
 
     def __init__(self) -> None:
-        self.scenario: Scenario | None = None
-        """The scenario adopted last."""
+        self.scenario: Scenario | None = None  # the scenario adopted last
         self._frame: Frame | None = None
-        self._looked = False
-        """Whether the binding that is being read has looked at the frame."""
+        self._looked = False  # whether the binding that is being read has looked at the frame
         self._session: Session | None = None
         self._bindings: list[_Binding] = []
         self._showing = threading.Lock()  # edits are adopted by one thread, frames reported by another
@@ -171,8 +225,12 @@ class Bindings:
         return self.on(buttons, press)
 
     def on_command(self, command: Handle, act: Callable[[Session], None]) -> None:
-        """Call `act`, which must only submit, when a command of the palette is given."""
-        on_command(command, lambda: act(self._session) if self._session is not None else None)
+        """Call `act`, which must only submit, when an enabled command of the palette is given."""
+
+        @command.on_trigger
+        async def _(_event: viser.CommandEvent) -> None:
+            if self._session is not None:
+                act(self._session)
 
     def adopt(self, scenario: Scenario) -> None:
         """Show what is new in a scenario."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from types import MappingProxyType
@@ -11,7 +11,7 @@ from typing import Any
 import viser
 
 from dt_viz.avoidance.avoidance import Space
-from dt_viz.errors import Cancelled, FormatError
+from dt_viz.errors import Cancelled
 from dt_viz.robot.placement import is_jaco
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.paper_scenes import SCENES, PaperScene, found, offered
@@ -20,37 +20,42 @@ from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import avoidance_layer, avoiding_with
 from dt_viz.scenario.tasks import Task
 from dt_viz.session.frame import Frame
+from dt_viz.session.history import Camera
 from dt_viz.session.progress import Progress
 from dt_viz.session.session import CHOICES, Session
 from dt_viz.ui import patches
-from dt_viz.ui.bindings import Bindings
-from dt_viz.ui.controls import Control
+from dt_viz.ui.bindings import Bindings, Control
+from dt_viz.ui.gate import MAX_UPLOAD
 from dt_viz.ui.keeping import Storage
 from dt_viz.ui.pen import Pen
 from dt_viz.ui.scene.camera import CameraController, Pose
-from dt_viz.ui.scene.figure import render_figure
+from dt_viz.ui.scene.export import Order
+from dt_viz.ui.scene.figure import Step
 from dt_viz.ui.scene.palette import Colour
 from dt_viz.ui.scripts import Link
 from dt_viz.ui.tabs.about import Command, add_about, add_commands, numbered
 from dt_viz.ui.tabs.arm import add_arm, add_joints
 from dt_viz.ui.tabs.compare import ComparePanel
-from dt_viz.ui.tabs.opening import OpenPanel, Show
-from dt_viz.ui.tabs.picture import Film, PictureTab, Presentation, big_type
-from dt_viz.ui.tabs.saving import Step
+from dt_viz.ui.tabs.opening import OpenPanel, Show, TeachPanel
+from dt_viz.ui.tabs.picture import PictureTab, Presentation, big_type
 from dt_viz.ui.tabs.show import ShowTab
 from dt_viz.ui.tabs.stack import StackPanel
 from dt_viz.ui.tabs.status import COLOURS, StatusLine, hint, hint_html, sentence
-from dt_viz.ui.tabs.teaching import TeachPanel
 from dt_viz.ui.tabs.timeline import PAST
 from dt_viz.ui.tabs.tour import NUMBERS, Tour
 from dt_viz.ui.tabs.world import add_obstacles, add_starts, add_transforms
 from dt_viz.warning import Severity
 
-MAX_UPLOAD = 50 * 10**6
-"""Largest number of bytes of what a visitor sends."""
 NO_SCENE = "–"
 OFF = "Off"
-SAVE_HINT = "Save: all that you have made, your own demonstrations too, as a file; “Open a file” goes on with it"
+DELETE = "Delete this task"
+HISTORY = {
+    "Undo": "takes the last change back (key Z)",
+    "Redo": "makes the change again that was taken back (Shift Z)",
+    "Reset": "back to how all began, camera too (R); Undo brings it back",
+    "Save": "a file of what is shown; “Open a file” goes on with it",
+}
+"""Hints of the buttons of the history."""
 SPACES: Mapping[str, Space] = {"Hand": "task", "Arm": "cspace"}
 """Spaces of the avoidance, by their names on the page."""
 
@@ -64,16 +69,13 @@ class ControlPanel:
         titles: Mapping[str, str],
         robot: Robot,
         arms: Mapping[str, str],
-        render: Callable[[str, bool, Cancelled], bytes],
+        draw: Callable[[Order, Step, Cancelled], bytes],
         send: Callable[[str, bytes], None],
         notify: Callable[[str, Colour], None],
         tripod: CameraController,
         darken: Callable[[bool], None],
         preview: Show = lambda _seen, _number: None,
-        forget: Callable[[], None] = lambda: None,
         save: Callable[[Session], None] = lambda _session: None,
-        record: Callable[[Step], bytes] = lambda _step: b"",
-        film: Film = lambda *_what: b"",
         open_scenario: Callable[[str, bytes], bool] = lambda _name, _content: False,
         pen: Pen | None = None,
         storage: Storage | None = None,
@@ -82,14 +84,14 @@ class ControlPanel:
     ) -> None:
         """Build the controls, for the titles of tasks and arms by name; they act once `connect` has given a session.
 
-        `render` makes a picture, see `PictureTab`; `send` sends a file whose name ends like this, with a content.
-        `save` sends the scenario as a file and must only submit, `record` makes a page that replays what is shown,
-        `film` a video. `open_scenario` goes on with the scenario of a file if it holds one. A visitor teaches with the
-        `pen`. The browser's `storage` keeps where the visitor is in the tour, at whose end `came_back` is called; see
-        `Tour`. A link may name one of the `scenarios`, which begin when they are called.
+        `draw` makes a picture or a video; `send` sends a file whose name ends like this, with a content. `save`
+        sends the scenario as a file and must only submit. `open_scenario` goes on with the scenario of a file
+        if it holds one. A visitor teaches with the `pen`. The browser's `storage` keeps where the visitor is in
+        the tour. `came_back` takes the camera to a pose at the end of the tour, see `Tour`, and where Reset is
+        undone. A link may name one of the `scenarios`, which begin when they are called.
         """
-        self._notify, self._titles, self._scenarios = notify, dict(titles), scenarios
-        self._scenes = {scene.title: scene for scene in offered(self._titles)}
+        self._notify, self._titles, self._scenarios = notify, lambda: titles, scenarios
+        self._scenes = {scene.title: scene for scene in offered(titles)}
         self.bindings = bindings = Bindings()
         self.presentation = Presentation(gui, self._turn, lambda alone: tripod.reframe(alone=alone))
         bindings.show(self._title, lambda title: self.presentation.write(title=title))
@@ -103,10 +105,11 @@ class ControlPanel:
         self.hint = gui.add_html(hint_html(""))
         add_avoid_and_imitate(gui, bindings)
         self.status = StatusLine(gui, bindings)
-        reset = partial(self._reset, (tripod.view, forget))
+        reset = partial(self._reset, tripod, came_back)
         travels = {"Undo": Session.undo, "Redo": Session.redo, "Reset": reset, "Save": save}
-        buttons = gui.add_button_group("History", tuple(travels), hint=SAVE_HINT)
-        bindings.on(buttons, lambda session, button: travels[button](session))
+        for button, act in travels.items():
+            group = gui.add_button_group("History" if button == "Undo" else button, (button,), hint=HISTORY[button])
+            bindings.on(group, lambda session, _pressed, act=act: act(session))
         gui.add_html(patches.PANEL)
         tabs = gui.add_tab_group()
         with tabs.add_tab("World"):
@@ -123,8 +126,7 @@ class ControlPanel:
         with tabs.add_tab("Compare"):
             ComparePanel(gui, bindings, send)
         with tabs.add_tab("Picture"):
-            act = {"darken": darken, "enlarge": enlarge, "render": render, "draw": self._draw, "record": record}
-            picture = PictureTab(gui, bindings, tripod, self.presentation, film=film, send=send, **act)
+            picture = PictureTab(gui, bindings, tripod, self.presentation, darken, enlarge, draw, send)
         commands = self._commands(gui.main_panel, picture, reset, save)
         add_commands(gui, bindings, commands)
         add_about(gui, bindings, commands, self.tour.take)
@@ -133,12 +135,14 @@ class ControlPanel:
     def take(self, robot: Robot) -> None:
         """Plot the joints of another arm, and offer the scenes that it has."""
         self.show.plots.take(robot)
-        offers = {scene.title: scene for scene in offered(self._titles, jaco=is_jaco(robot))}
+        offers = {scene.title: scene for scene in offered(self._titles(), jaco=is_jaco(robot))}
         if offers != self._scenes:
             self._scenes, self._scene.handle.options = offers, (NO_SCENE, *offers)
 
     def connect(self, session: Session) -> None:
         """Let the controls edit this session."""
+        shipped = self._titles()
+        self._titles = lambda: {**shipped, **{name: task.title for name, (task, _) in session.taught.items()}}
         self.bindings.connect(session)
 
     @property
@@ -179,11 +183,15 @@ class ControlPanel:
         """Add the dropdowns of tasks and scenes, and what opens recordings; return that, and the one of the scenes."""
 
         def choose(session: Session, title: str) -> None:
-            session.choose_task(next(name for name in self._titles if self._titles[name] == title))
+            session.choose_task(next(name for name, other in self._titles().items() if other == title))
 
-        tasks = gui.add_dropdown("Task", tuple(self._titles.values()), hint="what is learned from demonstrations")
-        self.bindings.properties(tasks, options=lambda _: tuple(self._titles.values()))
-        self.bindings.choice(tasks, lambda s: self._titles[s.task], partial(self.begin, choose))
+        shipped = self._titles()
+        tasks = gui.add_dropdown("Task", tuple(shipped.values()), hint="what is learned from demonstrations")
+        self.bindings.properties(tasks, options=lambda _: tuple(self._titles().values()))
+        self.bindings.choice(tasks, lambda s: self._titles()[s.task], partial(self.begin, choose))
+        hint = "out of the list and of this browser; Undo brings it back"
+        delete = gui.add_button_group("Own task", (DELETE,), hint=hint, visible=False)
+        self.bindings.on(delete, partial(self.begin, self._delete), visible=lambda s: s.task not in shipped)
         opening = OpenPanel(gui, self.bindings, preview, self._learn, MAX_UPLOAD, take, send)
         return opening, self.bindings.choice(
             gui.add_dropdown("Scene", (NO_SCENE, *self._scenes), hint="scenes of the paper's figures"),
@@ -196,16 +204,16 @@ class ControlPanel:
 
         def begin(session: Session, _title: str) -> None:
             choose = session.choose_task if task.imitation is None else session.begin_task
-            choose(self._bring(session, task))
+            choose(session.bring(task).name)
 
         self.begin(begin, session, task.title)
 
-    def _bring(self, session: Session, task: Task, arm: str | None = None) -> str:
-        """Take a task of the visitor's own; return its name. See `Session.bring`."""
-        own, gone = session.bring(task, arm)
-        kept = {name: title for name, title in self._titles.items() if name != gone}
-        self._titles = kept | {own.name: own.title}
-        return own.name
+    def _delete(self, session: Session, _title: str) -> None:
+        """Take the visitor's own task that is shown out of the list, and begin the one before it."""
+        name, titles = session.scenario.task, self._titles()
+        if name in session.taught:
+            session.delete(name, [*titles][[*titles].index(name) - 1])
+            session.say(f"“{titles[name]}” is deleted; Undo brings it back.", Severity.NOTE)
 
     def resume(self, session: Session, saved: Saved, began: Callable[[Saved], None]) -> None:
         """Go on with what was saved, beside the server's event loop; `began` gets it with its task's name on this page.
@@ -217,7 +225,7 @@ class ControlPanel:
             scenario = saved.scenario
             check_shapes(scenario)
             if saved.own is not None:
-                scenario = replace(scenario, task=self._bring(session, saved.own.task, scenario.arm))
+                scenario = replace(scenario, task=session.bring(saved.own.task, scenario.arm).name)
             began(replace(saved, scenario=scenario))
             session.restore(scenario)
             if saved.lesson is not None:
@@ -228,7 +236,7 @@ class ControlPanel:
     def _title(self, scenario: Scenario) -> str:
         if self.tour.step is not None:
             return self.tour.step.title
-        return SCENES[scenario.scene].title if scenario.scene in SCENES else self._titles[scenario.task]
+        return SCENES[scenario.scene].title if scenario.scene in SCENES else self._titles()[scenario.task]
 
     def _turn(self, step: int) -> None:
         """Go to a scene so many places after the shown one, before the first is the last; or to a step of the tour."""
@@ -251,12 +259,12 @@ class ControlPanel:
     def follow(self, session: Session, link: Link) -> None:
         """Begin the scene, the task, the tour or the scenario that a link asks for; where there is none, say so."""
         scene = found(link.name, self._scenes.values()) if link.kind == "scene" else None
-        names = {"scene": [each.name for each in self._scenes.values()], "task": self._titles, "tour": NUMBERS}
+        names = {"scene": [each.name for each in self._scenes.values()], "task": self._titles(), "tour": NUMBERS}
         names["scenario"] = self._scenarios
         if scene is not None:
             self.begin(self._load, session, scene.title)
-        elif link.kind == "task" and link.name in self._titles:
-            self.begin(lambda session, _title: session.begin_task(link.name), session, self._titles[link.name])
+        elif link.kind == "task" and link.name in names["task"]:
+            self.begin(lambda session, _title: session.begin_task(link.name), session, self._titles()[link.name])
         elif link.kind == "tour" and link.name in ("", *NUMBERS):
             self.tour.take(session, int(link.name or 1) - 1)
         elif link.kind == "scenario" and link.name in self._scenarios:
@@ -290,13 +298,6 @@ class ControlPanel:
 
         session.expect(True)
         session.jobs.submit(CHOICES, work, latest=True)
-
-    def _draw(self, suffix: str, step: Step) -> bytes:
-        """Draw the frame that is shown as a figure; raises FormatError where there is none yet."""
-        frame = self.bindings.frame
-        if frame is None:
-            raise FormatError("the scene", "nothing yet", "a scene that is shown")
-        return render_figure(frame, suffix, step)
 
     def _commands(
         self,
@@ -333,14 +334,18 @@ class ControlPanel:
             *numbered(tuple(self._scenes), partial(self.begin, self._load)),
         ]
 
-    def _reset(self, begin_anew: Iterable[Callable[[], None]], session: Session) -> None:
-        """Reset the session, and what else begins anew; in the tour, begin the step anew."""
+    def _reset(self, tripod: CameraController, came_back: Callable[[Pose | None], None], session: Session) -> None:
+        """Reset the session and the camera; in the tour, begin the step anew."""
+
+        def put_back(pose: Pose | None) -> None:
+            tripod.view()
+            came_back(pose)
+
         if self.tour.step is not None:
             self.tour.turn(session, 0)
             return
-        session.reset()
-        for begin in begin_anew:
-            begin()
+        session.reset(Camera(lambda: tripod.chosen, put_back))
+        tripod.view()
 
 
 def add_avoid_and_imitate(gui: viser.GuiApi, bindings: Bindings) -> None:

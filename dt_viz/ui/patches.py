@@ -1,7 +1,7 @@
-"""What is used of viser and websockets beyond what they document, and changed in them; nothing else does either.
+"""What is used of viser and websockets beyond what they document, and changed in them; no other module does either.
 
-Each function names the public hook that would replace it. What it needs is checked when the server starts. Styles of
-elements of viser's page are HTML that is to stand on it; each would be replaced by an option of its elements.
+Each docstring names the issue or pull request of github.com/viser-project/viser that it waits for, or says what viser
+lacks where there is none. `open_server` checks what it needs. Styles are HTML that is to stand on viser's page.
 """
 
 from __future__ import annotations
@@ -12,11 +12,13 @@ import functools
 import io
 import socket
 import threading
-from collections import OrderedDict
-from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import ExitStack, contextmanager, redirect_stdout, suppress
+import time
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, wait
+from contextlib import contextmanager, redirect_stdout, suppress
 from types import SimpleNamespace
 from typing import Any, get_type_hints
+from uuid import uuid4
 
 import numpy as np
 import viser
@@ -26,6 +28,8 @@ import viser._scene_api
 import viser._viser
 import viser.infra._async_message_buffer
 import websockets.asyncio.server
+
+from dt_viz.errors import FormatError
 
 Options = Callable[[Any, dict[str, Any]], tuple[Any, dict[str, Any]]]
 """Function of a handler of connections and of options of `websockets.serve`, which returns others."""
@@ -38,11 +42,13 @@ PANEL = """<style>
     }
 }
 </style>"""
-"""Style of the panel: all tabs lie in one row, and on a phone it is as wide as the window."""
+"""Style of the panel: all tabs lie in one row, and on a phone it is as wide as the window. Waits for #617."""
 ROW = (
     "<style>div:has(> .dt-row) + div > div > :first-child { width: auto !important; }</style><div class='dt-row'></div>"
 )
-"""Mark and style of a group of buttons that needs the room beside its label to lie in one row."""
+"""Mark and style of a group of buttons that needs the room beside its label to lie in one row. Waits for #655."""
+UNSEEN = "<style>div:has(> .dt-unseen) + div { display: none; }</style><div class='dt-unseen'></div>"
+"""Mark and style that hide the control after it, which a script writes to; viser lacks messages of a page's script."""
 ALONE = """<style>
 .mantine-Paper-root:has(.dt-caption) { visibility: hidden; }
 .dt-caption, div:has(> .dt-caption) + div { visibility: visible; position: fixed; bottom: 0; box-sizing: border-box; }
@@ -57,13 +63,16 @@ div:has(> .dt-caption) + div label { display: none; }
 div:has(> .dt-caption) + div > div > :first-child { display: none; }
 @media (max-width: 700px) { .dt-caption { padding: 1.6em 1.2em 3.4em; } }
 </style>"""
-"""Style that hides the panel around the caption, and puts that and the buttons after it at the foot of the window."""
+"""Style that hides the panel around the caption, and puts that and the buttons after it at the foot of the window.
+
+Waits for #617.
+"""
 AT_THE_FOOT = """<style>@media (max-width: 576px) {
   div:has(> .mantine-Tabs-root .dt-timeline) {
     position: sticky; bottom: 0; z-index: 1; background: var(--mantine-color-body);
   }
 }</style><div class='dt-timeline'></div>"""
-"""Mark and style of a window that stays at the foot on a phone, where it is a part of the sheet."""
+"""Mark and style of a window that stays at the foot on a phone, where it is a part of the sheet. Waits for #617."""
 
 
 class GateError(RuntimeError):
@@ -74,12 +83,12 @@ class GateError(RuntimeError):
 
 
 def declared(name: str) -> type:
-    """Return the dataclass of a kind of messages; AttributeError if there is none. Hook: a public list of them."""
+    """Return the dataclass of a kind of messages; viser lacks a public list of them. Raises AttributeError."""
     return getattr(viser._messages, name)
 
 
 def open_server(options: Options, listening: socket.socket, **arguments: Any) -> viser.ViserServer:  # noqa: ANN401
-    """Start a server of viser. Hook: options of `ViserServer` that are passed on to `websockets.serve`.
+    """Start a server of viser; `ViserServer` lacks options that are passed on to `websockets.serve`.
 
     Args:
         options: function of viser's handler of connections and of its options for `websockets.serve`; it returns
@@ -90,6 +99,7 @@ def open_server(options: Options, listening: socket.socket, **arguments: Any) ->
     Raises:
         GateError: viser does not start its server as expected.
     """
+    _correct()
     module: Any = websockets.asyncio.server
     original, used, whole = module.serve, [], threading.Event()
 
@@ -105,7 +115,7 @@ def open_server(options: Options, listening: socket.socket, **arguments: Any) ->
 
     module.serve = serve
     try:
-        with redirect_stdout(io.StringIO()):  # an address, as seen by viser
+        with redirect_stdout(io.StringIO()):  # viser prints its address, which is not that of the supervisor
             server = viser.ViserServer(**arguments)
     finally:
         module.serve = original
@@ -118,7 +128,10 @@ def open_server(options: Options, listening: socket.socket, **arguments: Any) ->
 
 
 def report_failures(report: Callable[[BaseException], None]) -> None:
-    """Have `report` called with what viser's callbacks raise, which it would print. Hook: `on_callback_error`."""
+    """Have `report` called with what viser's callbacks raise.
+
+    viser prints it, since #377; it lacks a callback for these errors.
+    """
 
     def report_task(task: Any) -> None:  # noqa: ANN401 - a future, or a task
         if not task.cancelled() and task.exception() is not None:
@@ -129,13 +142,16 @@ def report_failures(report: Callable[[BaseException], None]) -> None:
         "print_task_error": report_task,
         "print_awaited_callback_error": report,
     }
-    for module in (viser._gui_api, viser._scene_api, viser._viser):
-        for name in reports.keys() & vars(module):
-            setattr(module, name, reports[name])
+    for module in (viser._gui_api, viser._gui_handles, viser._scene_api, viser._viser):
+        vars(module).update(reports)
 
 
 class _Event(asyncio.Event):
-    """An event that only its own loop sets: in other threads `set` does nothing, as viser then has the loop set it."""
+    """An event that only its own loop sets: in other threads `set` does nothing, as viser then has the loop set it.
+
+    Else a thread may set it just before the loop begins to wait; then the loop's own `set` does nothing, and the page
+    receives no more messages. #223 locks the buffer, but not this event.
+    """
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         super().__init__()
@@ -147,59 +163,87 @@ class _Event(asyncio.Event):
                 super().set()
 
 
-def tell_from_threads() -> None:
-    """Let any thread queue messages: viser sets an asyncio event in that thread, and once more in the loop.
+@functools.cache
+def _correct() -> None:
+    """Correct viser for all servers of this process.
 
-    Where a thread sets it just before the loop waits for it, the loop sleeps, later calls of `set` do nothing as it is
-    set, and the page stands still for ever. Hook: none is needed where viser sets it in its loop alone.
+    viser evaluates the types of properties for each handle, a third of the time that a page takes; it lacks a cache.
     """
     buffer: Any = viser.infra._async_message_buffer.AsyncMessageBuffer
-    original = buffer.__init__
+    base: Any = viser._assignable_props_api.AssignablePropsBase
+    initialise, hints = buffer.__init__, functools.cache(get_type_hints)
 
-    @functools.wraps(original)
-    def initialise(self: Any, *arguments: Any, **options: Any) -> None:  # noqa: ANN401
-        original(self, *arguments, **options)
+    def initialise_with_event(self: Any, *arguments: Any, **options: Any) -> None:  # noqa: ANN401
+        initialise(self, *arguments, **options)
         self.message_event = _Event(self.event_loop)
 
-    if not hasattr(original, "__wrapped__"):
-        buffer.__init__ = initialise
-
-
-def evaluate_hints_once() -> None:
-    """Have viser evaluate the types of properties once for each class, not for each handle: a third of a page's time.
-
-    Hook: none is needed where viser caches them by class.
-    """
-    base: Any = viser._assignable_props_api.AssignablePropsBase
-    if isinstance(vars(base).get("_prop_hints"), functools.cached_property):
-        hints = functools.cache(get_type_hints)
-        base._prop_hints = property(lambda handle: hints(type(handle._impl.props)))
+    buffer.__init__ = initialise_with_event
+    base._prop_hints = property(lambda handle: hints(type(handle._impl.props)))
 
 
 def client_of(server: viser.ViserServer, connection: Any) -> viser.ClientHandle | None:  # noqa: ANN401
-    """Return the client of a connection; None before its page has told a camera. Hook: `ClientHandle.connection`."""
-    live = server._websock_server._live_connections
-    ids = [client_id for client_id, other in live.items() if other is connection]
+    """Return the client of a connection; None before its page has sent a camera. `ClientHandle` lacks a connection."""
+    ids = [number for number, other in server._websock_server._live_connections.items() if other is connection]
     return server.get_clients().get(ids[0]) if ids else None
 
 
 def connection_of(server: viser.ViserServer, client_id: int) -> Any:  # noqa: ANN401 - of websockets
-    """Return the connection of a client; None if it has left. Hook: `ClientHandle.connection`."""
+    """Return the connection of a client; None if it has left. `ClientHandle` lacks it."""
     return server._websock_server._live_connections.get(client_id)
 
 
+def rendered(client: viser.ClientHandle, size: tuple[int, int], shot: Mapping[str, Any], timeout: float) -> bytes:
+    """Have a browser render its scene as a PNG; return its answer, which may be any bytes.
+
+    `ClientHandle.get_render`, also since #751, decodes pictures of any format and size; it lacks a way not to.
+
+    Args:
+        client: the browser; the server's event loop must not call this.
+        size: width and height, pixels.
+        shot: `wxyz`, `position` and `fov` of the camera.
+        timeout: longest time to wait, seconds.
+
+    Raises:
+        FormatError: the browser has left.
+        TimeoutError: the browser did not answer.
+    """
+    messages, connection, uuid = viser._messages, client._websock_connection, uuid4().hex
+    answer, deadline = Future[bytes](), time.monotonic() + timeout
+
+    def take(_client_id: int, message: Any) -> None:  # noqa: ANN401 - GetRenderResponseMessage
+        if message.render_uuid == uuid and not answer.done():
+            answer.set_result(message.payload)
+
+    numbers: dict[str, Any] = {name: np.asarray(value, float).tolist() for name, value in shot.items()}
+    width, height = size
+    connection.register_handler(messages.GetRenderResponseMessage, take)
+    try:
+        client._viser_server.flush()
+        asked = messages.GetRenderRequestMessage("image/png", height, width, 80, **numbers, render_uuid=uuid)
+        connection.queue_message(asked)
+        client.flush()
+        while not wait([answer], 0.1).done:
+            if client.client_id not in client._viser_server.get_clients():
+                raise FormatError("the browser", "one that has left", "a page that stays open")
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"the browser drew nothing within {timeout:g} s")
+    finally:
+        connection.unregister_handler(messages.GetRenderResponseMessage, take)
+    return answer.result()
+
+
 def name_of(handle: Any) -> str:  # noqa: ANN401
-    """Return the name of a control in the page. Hook: `handle.uuid`."""
+    """Return the name of a control in the page; handles lack it."""
     return handle._impl.uuid
 
 
 def drop_uploads(client: viser.ClientHandle) -> None:
-    """Let go of files that a client has not sent to the end. Hook: a limit of uploads that are under way."""
+    """Forget files that a client has not sent to the end; viser, since #168, lacks a limit of unfinished uploads."""
     client.gui._drop_uploads_from_client(client._websock_connection.client_id)  # pyright: ignore[reportArgumentType]
 
 
 def refuse_upload(client: viser.ClientHandle, message: Any) -> None:  # noqa: ANN401 - FileTransferStartUpload
-    """Have the page end an upload, which it shows until all of it is acknowledged. Hook: an upload that is refused."""
+    """Have the page end an upload, which it shows until all of it is acknowledged; viser lacks a refusal."""
     size, uuid = message.size_bytes, message.transfer_uuid
     acknowledged = viser._messages.FileTransferPartAck(message.source_component_uuid, uuid, size, size)
     client._websock_connection.queue_message(acknowledged)
@@ -207,14 +251,14 @@ def refuse_upload(client: viser.ClientHandle, message: Any) -> None:  # noqa: AN
 
 
 def hide_upload(client: viser.ClientHandle, uuid: str) -> None:
-    """Have the page no longer show an upload, which it would call a success. Hook: a text of one's own for its end."""
+    """Have the page no longer show an upload, which it would call a success; viser lacks a text for its end."""
     client._websock_connection.queue_message(viser._messages.RemoveNotificationMessage(f"upload-{uuid}"))
 
 
 def put_back(handle: Any, value: Any, *, shown: bool) -> None:  # noqa: ANN401
-    """Assign the value of a control, and show it in the browser if `shown`. Hook: a setter that calls nothing back.
+    """Assign the value of a control, and show it in the browser if `shown`; viser lacks a setter that only does this.
 
-    viser's own casts to the type of the browser's claim, and calls back on a loop that may have ended.
+    Its own casts to the type of the browser's claim, and calls back on a loop that may have ended.
     """
     handle._impl.value = value
     if shown:
@@ -222,71 +266,36 @@ def put_back(handle: Any, value: Any, *, shown: bool) -> None:  # noqa: ANN401
 
 
 def put_back_pose(gizmo: viser.TransformControlsHandle, position: Any, wxyz: Any) -> None:  # noqa: ANN401
-    """Show a pose in the browser, also where it was assigned last. Hook: a handler that may refuse a pose.
+    """Show a pose in the browser, also where it was assigned last; viser lacks a handler that may refuse a pose.
 
-    viser stores whatever the browser sent, and skips values that it has already.
+    It stores any pose from the browser, and skips values that it has already.
     """
     gizmo._impl.position, gizmo._impl.wxyz = np.full(3, np.nan), np.full(4, np.nan)
     gizmo.position, gizmo.wxyz = position, wxyz
 
 
+STEP_GROUPS = [f"div:has(> .dt-steps){' + div' * k}" for k in range(1, 5)]
+"""Selectors of the four groups of one button after `steps_html`."""
+_WIDE = "(100% - 7.25em - 2 * var(--mantine-spacing-xs) - 3 * 0.375em) / 4"
+IN_A_ROW = f"""
+{", ".join(STEP_GROUPS)} {{ display: inline-block; vertical-align: top; width: calc({_WIDE} + 0.375em);
+  padding-inline: 0.375em 0 !important; }}
+{STEP_GROUPS[0]} {{ width: calc({_WIDE} + 7.25em + var(--mantine-spacing-xs));
+  padding-inline: var(--mantine-spacing-xs) 0 !important; }}
+{", ".join(f"{group} > div > :first-child" for group in STEP_GROUPS[1:])} {{ display: none; }}
+{", ".join(f"{group} button" for group in STEP_GROUPS)} {{ padding: 0; }}
+"""
+"""Style that lays these groups in a row behind the label of the first one, as viser lays the buttons of one group."""
+
+
 def steps_html(steps: tuple[bool, bool]) -> str:
-    """Return what dims the first two of the buttons after it, Undo and Redo, where there is no such step."""
-    idle = (f"div:has(> .dt-steps) + div button:nth-of-type({k})" for k, step in enumerate(steps, start=1) if not step)
-    style = "".join(f"{button} {{ opacity: 0.35; pointer-events: none; }}" for button in idle)
-    return f"<style>{style}</style><div class='dt-steps'></div>"
+    """Return HTML that lays the four groups of one button after it in a row; waits for #655 (in work: #717).
 
-
-NUM_ENCODED = 16
-"""Number of the newest windows of messages that are kept as they are sent."""
-
-
-def encode_once() -> None:
-    """Encode what all clients of a server are sent once for all that are sent the same, not anew for each.
-
-    Hook: a cache in viser's producer of messages.
-
-    Raises:
-        GateError: viser does not produce them as expected.
+    One group of viser has one hint. The first two, Undo and Redo, are pale where there is no such step.
     """
-    module: Any = viser.infra._infra
-    if not hasattr(module, "_message_producer"):
-        raise GateError("its producer of messages")
-    original = module._message_producer
-
-    @functools.wraps(original)
-    async def produce(websocket: Any, buffer: Any, client_id: int, backlog_done_message: Any = None) -> None:  # noqa: ANN401
-        if not buffer.persistent_messages:  # those of one client
-            return await original(websocket, buffer, client_id, backlog_done_message)
-        # windows, so that their names stay theirs, and bytes
-        known = vars(buffer).setdefault("_encoded", OrderedDict())
-        windows = buffer.window_generator(client_id, backlog_done_message=backlog_done_message)
-        try:
-            async for window in windows:
-                name = tuple(map(id, window))
-                if name not in known:
-                    known[name] = window, await encoded(window)
-                    while len(known) > NUM_ENCODED:
-                        known.popitem(last=False)
-                await websocket.send(known[name][1])
-        finally:
-            await windows.aclose()
-
-    async def encoded(window: Any) -> bytes:  # noqa: ANN401
-        """Return what viser sends of one window."""
-        sent: list[bytes] = []
-
-        async def once(_client_id: int, backlog_done_message: None) -> AsyncIterator[Any]:
-            yield window
-
-        async def send(raw: bytes) -> None:
-            sent.append(raw)
-
-        await original(SimpleNamespace(send=send), SimpleNamespace(done=False, window_generator=once), 0)
-        return sent[0]
-
-    if not hasattr(original, "__wrapped__"):
-        module._message_producer = produce
+    idle = (f"{group} button" for group, step in zip(STEP_GROUPS, steps, strict=False) if not step)
+    style = "".join(f"{button} {{ opacity: 0.35; pointer-events: none; }}" for button in idle)
+    return f"<style>{IN_A_ROW}{style}</style><div class='dt-steps'></div>"
 
 
 SEEN_BY_ALL = ("BackgroundImageMessage", "EnvironmentMapMessage", "EnableLightsMessage", "ThemeConfigurationMessage")
@@ -294,45 +303,41 @@ SEEN_BY_ALL = ("BackgroundImageMessage", "EnvironmentMapMessage", "EnableLightsM
 
 
 class Mirror:
-    """The scene of one client as all others see it, also later ones: what is drawn in it is drawn once for all.
+    """Copy of one client's scene for all other clients, also for those that connect later.
 
     Nothing in the copy can be clicked or dragged, and viser's server knows no node of it: gizmos are plain frames, and
-    what a client listens to, its panel and its camera are not passed on.
+    bindings of clicks and drags, the panel and the camera of the client are not passed on.
 
-    Hook: nodes that are drawn in one scope, and handled in another one.
+    Scopes, since #758, are those of one client or of all; viser lacks nodes that all see and one client handles.
     """
 
     def __init__(self, server: viser.ViserServer, client: viser.ClientHandle) -> None:
-        """Begin with an empty scene, in place of what was mirrored before; then all that the client is sent counts."""
-        self._shared, self._connection = server._websock_server, client._websock_connection
-        self._excluded, self._gizmos = client.client_id, set[str]()
+        """Copy what the client is sent from now on, in place of the last copy."""
+        self._shared, self._gizmos = server._websock_server, set[str]()
+        self._connection: Any = client._websock_connection
+        alone, shared = self._connection.atomic, self._shared.atomic
+
+        @contextmanager
+        def atomic() -> Iterator[None]:
+            with alone(), shared():
+                yield
+
         buffer = self._shared.get_message_buffer()
         with buffer.buffer_lock:
-            nodes = [one for one in buffer.message_from_id.values() if one.entity_type == "scene"]
-        names = {one.name for one in nodes if one.lifecycle_phase == "create"}  # pyright: ignore[reportAttributeAccessIssue]
-        self._before = names - server.scene._handle_from_node_name.keys()
-        with self._shared.atomic():
-            for name in self._before:
+            nodes: list[Any] = [one for one in buffer.message_from_id.values() if one.entity_type == "scene"]
+        names = {one.name for one in nodes if one.lifecycle_phase == "create"}
+        with shared():
+            for name in names - server.scene._handle_from_node_name.keys():
                 self._shared.queue_message(viser._messages.RemoveSceneNodeMessage(name))
-        self._alone = self._connection.atomic
-        replaced: Any = self._connection
         with self._connection._record_lock:
-            replaced._record_handles.append(self)
-            replaced.atomic = self._atomic
+            self._connection._record_handles.append(self)
+            self._connection.atomic = atomic
 
     def end(self) -> None:
         """Leave the copy as it is."""
-        replaced: Any = self._connection
         with self._connection._record_lock:
-            replaced._record_handles.remove(self)
-            replaced.atomic = self._alone
-
-    @contextmanager
-    def _atomic(self) -> Iterator[None]:
-        with ExitStack() as stack:
-            stack.enter_context(self._alone())
-            stack.enter_context(self._shared.atomic())
-            yield
+            self._connection._record_handles.remove(self)
+            del self._connection.atomic  # that of its class is used again
 
     def _insert_message(self, message: Any) -> None:  # noqa: ANN401 - of viser, which calls this for each
         """Pass on a message that the client is sent, if all may see what it draws."""
@@ -349,54 +354,47 @@ class Mirror:
             return  # how large the handles are, and which
         else:
             copied = copy.copy(message)
+        copies = [copied]
         if message.entity_type == "scene":
             copied.owner = ""
-        copied.excluded_self_client = self._excluded
-        if message.lifecycle_phase == "create":
+        if message.lifecycle_phase == "create":  # a browser leaves a node of this name where it was
             self._shared.get_message_buffer().remove_entity_state_from_buffer("scene", name)
-        self._shared.queue_message(copied)
-        if message.lifecycle_phase == "create" and name in self._before:  # a browser would leave it where it was
-            for pose in (
+            copies += (
                 messages.SetOrientationMessage(name, (1.0, 0.0, 0.0, 0.0)),
-                messages.SetPositionMessage(name, (0.0, 0.0, 0.0)),
-            ):
-                self._shared.queue_message(pose)
+                messages.SetPositionMessage(name, (0.0,) * 3),
+            )
+        for one in copies:
+            one.excluded_self_client = self._connection.client_id
+            self._shared.queue_message(one)
 
 
 class Tape(viser.infra.WebsockMessageHandler):
-    """A scene of its own that no browser is connected to: what is drawn in it is recorded.
+    """A scene that no browser is connected to, and the recording of what is drawn in it.
 
-    Hook: a `SceneApi`, and its serializer, without a server.
+    viser lacks a `SceneApi`, and its serializer, without a server.
     """
 
     def __init__(self) -> None:
         super().__init__()
-        nothing: Any = None  # nobody answers: no loop calls anything back
+        nothing: Any = None  # without a browser no loop calls anything back
         self._unsent = viser.infra._async_message_buffer.AsyncMessageBuffer(nothing, persistent_messages=False)
         lock = SimpleNamespace(_scene_lifecycle_lock=threading.RLock())
         owner: Any = SimpleNamespace(_websock_connection=self, _viser_server=lock, client_id="")
-        self._serializer = self.get_message_serializer(lambda message: message.include_in_scene_serialization)
+        self.recording = self.get_message_serializer(lambda message: message.include_in_scene_serialization)
+        """Recording, whose `insert_sleep` passes time, and whose `as_html` ends it and returns a page that plays it."""
         self.scene = viser.SceneApi(owner, nothing, nothing)
         self.camera = viser._viser.InitialCameraConfig(self.queue_message)
-        """Where the camera is at first."""
+        """First pose of the camera."""
 
-    def get_message_buffer(self) -> Any:  # noqa: ANN401 - of what is sent, which is nothing
-        """Return where messages wait that are to be sent, which none are."""
+    def get_message_buffer(self) -> Any:  # noqa: ANN401
+        """Return viser's buffer of messages to be sent, which stays empty."""
         return self._unsent
 
     def queue_message(self, message: Any) -> None:  # noqa: ANN401 - of viser
         """Record a message of the scene."""
-        self._serializer._insert_message(message)
+        self.recording._insert_message(message)
 
     @contextmanager
     def atomic(self) -> Iterator[None]:
         """Do nothing: what is drawn at a moment of the recording is shown together anyway."""
         yield
-
-    def wait(self, seconds: float) -> None:
-        """Let some time of the recording pass."""
-        self._serializer.insert_sleep(seconds)
-
-    def html(self) -> str:
-        """End it; return a page that plays it again and again, with all that it needs."""
-        return self._serializer.as_html()

@@ -13,15 +13,12 @@ from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.starts import struck
 from dt_viz.session.session import Session
 from dt_viz.session.teaching import Stroke, board_of
-from dt_viz.ui import gestures
-from dt_viz.ui.gestures import Drag
+from dt_viz.ui.scene.markers import Drag, on_drag
 from dt_viz.ui.scene.robot_scene import RobotScene
 from dt_viz.ui.scene.scene import ScenePictures
 
-LANE = "pen"
-"""Lane of the session's jobs on which the line of a stroke is drawn."""
-Kind = Literal["draw", "guide"]
-"""Ways of teaching: on the board, or by the ball at the hand."""
+LANE = "pen"  # lane of the session's jobs on which the line of a stroke is drawn
+Kind = Literal["draw", "guide"]  # ways of teaching: on the board, or by the ball at the hand
 Finished = Callable[[Stroke, Slice | None], None]
 """Callback that takes a stroke, and the board that it is on. It must only submit."""
 
@@ -43,7 +40,7 @@ class Pen:
         self._area: Slice | None = None
         self._stroke = Stroke()
         self._finished: Finished = lambda _stroke, _area: None
-        gestures.on_drag(pictures.board.plate, self._drawn)
+        on_drag(pictures.board.plate, self._drawn)
 
     def take_up(self, kind: Kind, finished: Finished) -> None:
         """Begin to teach in a way; called beside the server's event loop. The arm minds no obstacle meanwhile."""

@@ -3,38 +3,34 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
+from dt_viz.errors import UnwantedError
 from dt_viz.flows.fields import Array
 from dt_viz.metrics import interpolate
 from dt_viz.motion.following import ArmMotion
-from dt_viz.session.jobs import Jobs
-from dt_viz.session.recording import Past, Recording
+from dt_viz.scheduler import SCHEDULER, Jobs
 from dt_viz.session.robot_loop import LiveArm, RoundSettings
 
 logger = logging.getLogger(__name__)
 
-Turn = Callable[[], AbstractContextManager[None]]
 
-LANE = "arm"
-"""Lane of the jobs on which the arm moves."""
-ALIKE = 1e-6
-"""Distance of two moments that are one, seconds."""
+LANE = "arm"  # lane of the jobs on which the arm moves
+ALIKE = 1e-6  # distance of two moments that are one, seconds
 
 
 @dataclass(frozen=True)
 class PlaybackSettings:
     """How often arms are drawn; times in seconds."""
 
-    shortest: float = 1 / 20
-    """Shortest time from one picture of an arm to the next."""
+    shortest: float = 1 / 20  # shortest time from one picture of an arm to the next
     longest: float = 1 / 6
     """Longest time from one picture to the next: at twice that an obstacle of 0.5 m/s reaches the arm unseen."""
     asleep: float = 0.5
@@ -43,16 +39,70 @@ class PlaybackSettings:
     """Part of its time that moving and drawing an arm takes: the more visitors there are, the fewer pictures."""
 
 
+SPAN = 60.0  # time that is remembered, seconds
+LEAST = 0.045
+"""Shortest time from one sample to the next, seconds: less than from one picture to the next."""
+NUM_SAMPLES = math.ceil(SPAN / LEAST) + 1  # number of samples that are remembered
+
+
+@dataclass(frozen=True, kw_only=True)
+class Past(ArmMotion):
+    """What the robot did; its times begin at 0."""
+
+    arrived: Array
+    """(T,) time since the robot came to the goal, seconds; 0 from when it sets out from a start until then."""
+    seeks: Array  # (T,) 1 where the robot is on its way to the goal, 0 elsewhere
+
+
+class Recording:
+    """The last `SPAN` seconds of a robot; one thread adds to it, any thread reads it."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._times = np.empty(NUM_SAMPLES)
+        self._rows: Array | None = None
+        """(NUM_SAMPLES, 2 n + 2) joint angles, those without avoidance, time since the arrival, and `Past.seeks`."""
+        self._num, self._now = 0, 0.0  # number of samples ever added, and time now, seconds
+
+    def add(self, seconds: float, q: Array, without: Array, arrived: float, *, seeks: bool) -> None:
+        """Add joint angles (n,), rad, and those without avoidance, unless the sample before is less than `LEAST` old.
+
+        `seconds` have passed since `add` was called before; see `Past` for the rest.
+        """
+        with self._lock:
+            self._now += seconds
+            if self._num and self._now - self._times[(self._num - 1) % NUM_SAMPLES] < LEAST:
+                return
+            if self._rows is None:
+                self._rows = np.empty((NUM_SAMPLES, 2 * len(q) + 2))
+            place = self._num % NUM_SAMPLES
+            self._times[place] = self._now
+            self._rows[place] = *q, *without, arrived, seeks
+            self._num += 1
+
+    @property
+    def past(self) -> Past | None:
+        """The last `SPAN` seconds; None before there are two samples."""
+        with self._lock:
+            if self._rows is None or self._num < 2:
+                return None
+            order = np.arange(max(0, self._num - NUM_SAMPLES), self._num) % NUM_SAMPLES
+            times, rows = self._times[order], self._rows[order]
+        kept = times >= times[-1] - SPAN
+        times, rows = times[kept], rows[kept]
+        n = rows.shape[1] // 2 - 1
+        q, without, arrived, seeks = np.split(rows, [n, 2 * n, 2 * n + 1], axis=1)
+        return Past(times - times[0], q, without, arrived=arrived[:, 0], seeks=seeks[:, 0])
+
+
 class Replay:
     """A motion that is played, like the arm in the loop; a new one takes over at the same moment of it."""
 
     def __init__(self) -> None:
-        self.motion: ArmMotion | None = None
-        """The motion; None before there is one."""
+        self.motion: ArmMotion | None = None  # the motion; None before there is one
         self.playing, self.loops, self.speed = True, True, 1.0
         """Whether its time passes, whether it begins anew after its end, and its speed relative to real time."""
-        self.jumps = 0
-        """Number of times that it was taken to another moment."""
+        self.jumps = 0  # number of times that it was taken to another moment
         self._clock = 0.0
         self._changing = threading.Lock()  # the page takes it to a moment while its time passes
 
@@ -175,8 +225,7 @@ class Playback:
         """Whether nobody has touched the page for a while, and others need the processor: the goal is not left then."""
         self._draw, self._settings = draw, settings
         self._playing, self._speed = True, 1.0
-        self._returns = 0
-        """Number of times that the robot was shown again after its past."""
+        self._returns = 0  # number of times that the robot was shown again after its past
 
     @property
     def arm(self) -> LiveArm | Replay:
@@ -218,12 +267,9 @@ class Playback:
         playing, speed = (self._playing, self._speed) if player is None else (player.playing, player.speed)
         return speed if playing else 0.0
 
-    def begin(self, jobs: Jobs, fail: Callable[[Exception], None], turn: Turn = nullcontext) -> None:
-        """Move the arm until the jobs are closed, each time within a `turn` that it waits for.
-
-        `fail` is told what stops it until its next motion.
-        """
-        jobs.submit(LANE, partial(self._loop, jobs, fail, turn))
+    def begin(self, jobs: Jobs, fail: Callable[[Exception], None]) -> None:
+        """Move the arm until the jobs are closed; `fail` is called with what stops it until its next motion."""
+        jobs.submit(LANE, partial(self._loop, jobs, fail))
 
     def play(self, playing: bool, speed: float, *, replays: bool) -> None:
         """Choose whether and how fast the robot moves, and whether its motion is shown in its place.
@@ -279,17 +325,19 @@ class Playback:
         if q is not None and (self._playing or q is not before):
             self.recording.add(seconds, q, q if without is None else without, live.arrived, seeks=live.left < 1)
 
-    def _loop(self, jobs: Jobs, fail: Callable[[Exception], None], turn: Turn) -> None:
+    def _loop(self, jobs: Jobs, fail: Callable[[Exception], None]) -> None:
         period = self._settings.shortest
         before = time.monotonic()
         while True:
-            jobs.rest(LANE, max(0.0, before + period - time.monotonic()))
+            jobs.rest(max(0.0, before + period - time.monotonic()), LANE)
             if jobs.superseded(LANE):
                 return
-            with turn():
+            with SCHEDULER.between_drags():
                 now, waits = time.monotonic(), self._waits
                 try:
                     self.advance(0.0 if waits else now - before)
+                except UnwantedError:  # the visitor has left
+                    return
                 except Exception as error:
                     logger.exception("the arm stopped")
                     self.live.stop()

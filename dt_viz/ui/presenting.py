@@ -1,7 +1,8 @@
-"""One scene that whoever has the key edits, and everyone else watches: frames are computed and sent for all at once.
+"""One scene that the visitor with the key edits, and all others watch: frames are computed once for all.
 
-The presenter's page is that of a visitor. What is drawn in it a `Mirror` sends to all who are connected; they have no
-session, and nothing of theirs changes the scene: a card says what is shown, and lets the camera follow the presenter's.
+The presenter's page is that of a visitor. A `Mirror` sends what is drawn in it to all clients, without its gizmos and
+its clickable nodes, as viser would send those of `server.scene` to viewers, too. Viewers have no session, and none of
+their messages changes the scene: a card says what is shown, and lets the camera follow the presenter's.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import logging
 import socket
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -22,10 +23,10 @@ import segno
 import viser
 
 from dt_viz.ui import patches
-from dt_viz.ui.controls import Control
-from dt_viz.ui.origins import is_loopback
+from dt_viz.ui.bindings import Control
+from dt_viz.ui.gate import is_loopback
 from dt_viz.ui.scene.camera import Framing, Pose, followed, window_size
-from dt_viz.ui.scripts import Ruler, forget_html
+from dt_viz.ui.scripts import Window, forget_html, report_window
 from dt_viz.ui.visitor import Visitor
 
 logger = logging.getLogger(__name__)
@@ -34,15 +35,13 @@ PERIOD, WORDS = 0.1, 5
 """Shortest time between two moves of a camera that follows, seconds, and number of these between two texts."""
 AWAY = "The presenter is away: this is the last scene."
 NOT_YET = "The presenter has not come yet."
-"""What viewers are told while there is no presenter, after one was there and before."""
-WRONG = "This key is not the one that the server has printed: you watch."
+"""Texts of the card without a presenter, after one was there and before."""
+WRONG = "This key is not the one that the server has printed. The page opens again, and you watch."
 TAKEN = "Another page has taken over with the key: you watch."
 OWN_MACHINE = "Only this machine gets there: start the server with --host 0.0.0.0."
-"""What the presenter is told beside an address that is of no use to others."""
-CARD = Framing(panel=0.0, under=0.36)
-"""The window of a viewer: the card lies at its edge."""
-ANYWHERE = ("", "0.0.0.0", "::")
-"""Hosts that stand for all addresses of this machine."""
+"""Text beside the address in the presenter's page where others cannot reach it."""
+CARD = Framing(panel=0.0, under=0.36)  # the window of a viewer: the card lies at its edge
+ANYWHERE = ("", "0.0.0.0", "::")  # hosts that stand for all addresses of this machine
 OVER_SCENE = """<div class='dt-address'><style>
 .dt-address {
     visibility: visible; position: fixed; left: 3vw; top: 50%; transform: translateY(-50%); z-index: 5;
@@ -63,39 +62,24 @@ SMALL = """<div class='dt-qr'><style>
 
 @dataclass
 class Viewer:
-    """Somebody who watches, or who waits for a place to."""
+    """A visitor who watches, or waits for a place."""
 
     client: viser.ClientHandle
-    ruler: Ruler = field(default_factory=Ruler)
-    width: float | None = None
-    """Width of the window, CSS pixels; None before it is measured."""
-    asking: viser.GuiHtmlHandle | None = None
-    """What measures the window, and asks for the key."""
+    width: float | None = None  # width of the window, CSS pixels; None before it is reported
     line: viser.GuiHtmlHandle | None = None
-    """What says what is shown; None while there is no card."""
-    follow: Control | None = None
-    """Whether the camera follows the presenter's."""
-    qr: viser.GuiHtmlHandle | None = None
-    """Address of the page, with its QR code."""
+    """Text of the card that says what is shown; None while there is no card."""
+    follow: Control | None = None  # whether the camera follows the presenter's
     seen: tuple[Pose, Framing] | None = None
-    """What the camera was put to last; None where it is to be put again."""
-
-    def clear(self) -> None:
-        """Take all from the panel."""
-        for handle in (self.asking, self.line, self.follow and self.follow.handle, self.qr):
-            if handle is not None:
-                handle.remove()
-        self.asking = self.line = self.follow = self.qr = None
+    """View of the presenter that the camera was put to last; None where it is to be put again."""
 
 
 @dataclass
 class Presenter:
-    """Whoever edits the scene."""
+    """The visitor who edits the scene."""
 
     client: viser.ClientHandle
     mirror: patches.Mirror
-    visitor: Visitor | None = None
-    """The page; None until it is built."""
+    visitor: Visitor | None = None  # the page; None until it is built
     label: str = ""
     """Title of the panel, with the number of those who watch; empty until it is shown."""
 
@@ -104,35 +88,40 @@ class Lecture:
     """The presenter, and those who watch."""
 
     def __init__(self, key: str, host: str, page: Callable[[viser.ClientHandle], str]) -> None:
-        """Begin with nobody.
+        """Begin without clients.
 
         Args:
             key: that of the presenter.
             host: name or address that the server listens on.
-            page: says the origin of a client's page, as of `Gate.page`.
+            page: returns the origin of a client's page, as `Gate.page`.
         """
         self._key, self._host, self._page = key, host, page
         self._lock = threading.RLock()  # viewers come and go in threads of their own
         self._viewers: dict[int, Viewer] = {}
         self._presenter: Presenter | None = None
-        self._absence = NOT_YET
-        """What viewers are told while there is no presenter."""
+        self._absence = NOT_YET  # text of the card without a presenter
         self._headline = _line(NOT_YET)
         self._closed = threading.Event()
-        patches.encode_once()
         threading.Thread(target=self._run, name="lecture", daemon=True).start()
 
     @property
     def presenter(self) -> viser.ClientHandle | None:
-        """Whoever edits the scene; None while nobody does."""
+        """Client that edits the scene; None without one."""
         with self._lock:
             return None if self._presenter is None else self._presenter.client
 
-    def ask(self, client: viser.ClientHandle) -> None:
-        """Have a page that has come tell the key, if it has one."""
+    def ask(self, client: viser.ClientHandle, claim: Callable[[str], None]) -> None:
+        """Have a page that has come report its window; `claim` is called with the presenter's key, if it has one."""
+        viewer = Viewer(client)
+
+        def reported(window: Window) -> None:
+            viewer.width, viewer.seen = window.width, None
+            if window.key:
+                claim(window.key)
+
         with self._lock:
-            viewer = self._viewers[client.client_id] = Viewer(client)
-        viewer.asking = client.gui.add_html(viewer.ruler.asking_html)
+            self._viewers[client.client_id] = viewer
+        report_window(client, reported)
 
     def welcome(self, client: viser.ClientHandle) -> None:
         """Give a viewer a card."""
@@ -144,33 +133,25 @@ class Lecture:
             hint = "off: your own camera stays where you move it"
             box = client.gui.add_checkbox("Follow the presenter's camera", True, hint=hint)
             viewer.follow = Control(box, lambda _on: setattr(viewer, "seen", None))
-            viewer.qr = client.gui.add_html(f"{patches.PANEL}{SMALL}{self._address_html(client)}</div>")
+            client.gui.add_html(f"{patches.PANEL}{SMALL}{self._address_html(client)}</div>")
 
-    def measured(self, token: str, width: float) -> None:
-        """Take the width of a viewer's window, CSS pixels."""
-        with self._lock:
-            for viewer in self._viewers.values():
-                if viewer.ruler.token == token:
-                    viewer.width, viewer.seen = width, None
+    def claimed(self, client: viser.ClientHandle, key: str) -> tuple[Viewer | None, bool]:
+        """Return the viewer of a client who claims to present, and whether the key is right.
 
-    def claimed(self, token: str, key: str) -> tuple[Viewer | None, bool]:
-        """Return the viewer who has told a key, if any, and whether it is the right one: then he watches no more."""
+        It is no viewer any more; there is none for a second claim.
+        """
         with self._lock:
-            viewer = next((one for one in self._viewers.values() if one.ruler.token == token), None)
-            is_right = hmac.compare_digest(self._key, key)
-            if viewer is not None and is_right:
-                del self._viewers[viewer.client.client_id]
-            return viewer, is_right
+            return self._viewers.pop(client.client_id, None), hmac.compare_digest(self._key.encode(), key.encode())
 
     def take(self, server: viser.ViserServer, viewer: Viewer) -> viser.ClientHandle | None:
         """Let a viewer present from now on, whose page can then be built.
 
         Returns:
-            The presenter until now, whose connection is to end.
+            The client that presented until now, whose connection is to end.
         """
         client = viewer.client
         with self._lock:
-            viewer.clear()
+            client.gui.reset()
             before = self._leave()
             large = client.gui.add_html(f"{OVER_SCENE}{self._address_html(client)}</div>", visible=False)
             hint = "of those who watch, with a QR code, over the scene"
@@ -188,18 +169,18 @@ class Lecture:
                 self._presenter.visitor, self._absence = visitor, AWAY
 
     def farewell(self, client: viser.ClientHandle) -> None:
-        """Forget somebody who has left."""
+        """Forget a client that has left."""
         with self._lock:
             self._viewers.pop(client.client_id, None)
             if self.presenter is client:
                 self._leave()
 
     def close(self) -> None:
-        """Tell nobody anything any more."""
+        """Send no more texts and cameras."""
         self._closed.set()
 
     def _leave(self) -> viser.ClientHandle | None:
-        """Let nobody present; return who did."""
+        """End the presentation; return the client that presented."""
         before, self._presenter = self._presenter, None
         if before is None:
             return None
@@ -213,12 +194,11 @@ class Lecture:
             try:
                 self._move()
                 if number % WORDS == 0:
-                    self._tell()
+                    self._write()
             except Exception:
-                logger.exception("viewers could not be told")
+                logger.exception("viewers could not be updated")
 
     def _move(self) -> None:
-        """Put the cameras that follow to where the presenter's is."""
         with self._lock:
             presenter, viewers = self._presenter, list(self._viewers.values())
         if presenter is None or presenter.visitor is None or (seen := presenter.visitor.seen) is None:
@@ -227,8 +207,8 @@ class Lecture:
             if viewer.follow is not None and viewer.follow.value:
                 _follow(viewer, seen)
 
-    def _tell(self) -> None:
-        """Tell viewers what is shown, and the presenter how many they are."""
+    def _write(self) -> None:
+        """Write what is shown on the viewers' cards, and their number in the title of the presenter's panel."""
         with self._lock:
             presenter, watching = self._presenter, [one for one in self._viewers.values() if one.line is not None]
             if presenter is None:

@@ -1,49 +1,74 @@
-"""Scripts on the page, beside viser's own: one sends several files at once, one tells what the window is and shows.
+"""Scripts on the page, beside viser's own: one sends several files at once, one reports the browser's window.
 
 An upload button of viser sends one file. So files that are chosen or dropped together are packed into one zip archive,
 without compression. Where scripts are not run, the button takes one file after another as it always does.
 
-viser's page reports the size of its canvas in the pixels that it is drawn with: device pixels, at most two for each CSS
-pixel at first, and fewer where drawing is slow. What lies beside the canvas, such as the panel, is measured in CSS
-pixels. So the page asks for an address that has the width in it, again whenever that changes.
-
-The server is not told what the address of the page says behind its `?`, as viser connects without that. So the page
-asks for an address that has it, too, and takes it out of its own: a reload goes on with what was made of it. The key of
-a presenter is told likewise, and is kept by the tab.
+viser reports the size of its canvas in the pixels that it is drawn with: device pixels, at most two for each CSS pixel
+at first, and fewer where drawing is slow. What lies beside the canvas, such as the panel, is measured in CSS pixels.
+Nor does viser report what stands behind the `?` of the page's address. So a script writes both into a hidden text
+input. Its value reaches the server as that of any control does, on the page's own websocket: another connection may be
+served by another process, and proxies log its address.
 """
 
 from __future__ import annotations
 
 import html
-import re
-import secrets
+import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from urllib.parse import unquote
+from typing import Annotated, Literal, get_args
 
+import msgspec
 import viser
 
 from dt_viz.ui import patches
+from dt_viz.ui.bindings import Control
 
-FOLDER = "window"
-NARROWEST, WIDEST = 240, 20_000
-"""Widths that a window can have, CSS pixels."""
-LONGEST = 100
-"""Largest number of characters of a name in a link."""
-MEASURE = """
-clearTimeout(window.dtVizTells);
-window.removeEventListener('resize', window.dtVizResized);
-const tell = () => fetch('ADDRESS/' + innerWidth, {cache: 'no-store'});
-window.dtVizResized = () => { clearTimeout(window.dtVizTells); window.dtVizTells = setTimeout(tell, 200); };
-window.addEventListener('resize', window.dtVizResized);
-tell();
-const page = new window.URL(location.href), kinds = KINDS.filter(kind => page.searchParams.has(kind));
-for (const kind of kinds.slice(0, 1))
-  fetch('ADDRESS/' + kind + '/' + encodeURIComponent(page.searchParams.get(kind)), {cache: 'no-store'});
-for (const kind of kinds) page.searchParams.delete(kind);
-if (kinds.length) history.replaceState(history.state, '', page);
+NARROWEST, WIDEST = 240, 20_000  # widths that a window can have, CSS pixels
+LONGEST = 100  # largest number of characters of a name in a link, and of a presenter's key
+Kind = Literal["scene", "task", "tour", "scenario"]
+KINDS: tuple[Kind, ...] = get_args(Kind)  # kinds of things that a link may open
+REPORT = """
+const mark = this.parentElement, page = new window.URL(location.href);
+let found = {}, timer;
+const take = name => {
+  const value = page.searchParams.get(name);
+  page.searchParams.delete(name);
+  return value?.slice(0, LONGEST);
+};
+for (const kind of KINDS) {
+  const name = take(kind);
+  if (name !== undefined) found.link ??= {kind, name};
+}
+const kept = 'dt-viz-present', key = take('present');
+if (key) found.key = key;
+try {
+  if (key) sessionStorage.setItem(kept, key);
+  else if (sessionStorage.getItem(kept)) found.key = sessionStorage.getItem(kept);
+} catch { if (key) page.searchParams.set('present', key); }
+history.replaceState(history.state, '', page);
+const report = () => {
+  if (!mark.isConnected) return;
+  const input = mark.nextElementSibling?.querySelector('input');
+  if (!input) return timer = setTimeout(report, 100);
+  const value = JSON.stringify({width: innerWidth, ...found});
+  Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, 'value').set.call(input, value);
+  input.dispatchEvent(new Event('input', {bubbles: true}));
+  found = {};
+};
+const resized = () => {
+  if (!mark.isConnected) return window.removeEventListener('resize', resized);
+  clearTimeout(timer);
+  timer = setTimeout(report, 200);
+};
+window.addEventListener('resize', resized);
+report();
 """
-"""Tells the width, and which of the KINDS of things is to be begun; ADDRESS is what is asked for."""
+"""Writes the window's width, the link and the presenter's key into the text input after it, and new widths later.
+
+KINDS are the kinds of links that are read and taken out of the address: a reload then goes on with what was made of the
+link. The key is taken out, too, and kept by the tab, which reports it again after a reload; where a tab keeps nothing,
+the key stays in the address.
+"""
 DROP = """
 const input = document.getElementById('file_upload_' + BUTTON);
 if (!input || input.multiple) return;
@@ -145,80 +170,53 @@ mark.parentElement.firstElementChild.scrollIntoView({block: 'nearest'});
 The page's camera, which these keys turn too, does not hear of it; what is typed in, and sliders, keep them.
 """
 
-PRESENT = """
-const name = 'dt-viz-present', page = new window.URL(location.href);
-let key = page.searchParams.get('present');
-try {
-  if (key) sessionStorage.setItem(name, key);
-  else key = sessionStorage.getItem(name);
-  page.searchParams.delete('present');
-  history.replaceState(history.state, '', page);
-} catch {}
-if (key) fetch('ADDRESS/present/' + encodeURIComponent(key), {cache: 'no-store'});
+FORGET = """
+const page = new window.URL(location.href);
+try { sessionStorage.removeItem('dt-viz-present'); } catch {}
+page.searchParams.delete('present');
+history.replaceState(history.state, '', page);
 """
-"""Tells the key of a presenter, and takes it out of the address: the tab keeps it, and tells it again after a reload.
-
-Where nothing is kept it stays in the address.
-"""
-FORGET = "try { sessionStorage.removeItem('dt-viz-present'); } catch {}"
-"""Keeps the key no longer."""
-
-KINDS = ("scene", "task", "tour", "scenario")
-"""Kinds of things that a link may ask for."""
+"""Takes a presenter's key out of the tab's storage and out of the address."""
 
 
-@dataclass(frozen=True)
-class Link:
+class Link(msgspec.Struct, frozen=True):
     """What the address of a page asks for, such as `/?scene=fig-4`."""
 
-    kind: str
-    """One of `KINDS`."""
-    name: str
-    """Name of a scene, a task or a scenario, or number of a step of the tour, from 1; the first one if empty."""
+    kind: Kind
+    name: Annotated[str, msgspec.Meta(max_length=LONGEST)]
+    """Name of a scene, a task or a scenario, or number of a step of the tour, from 1; empty for the first step."""
 
 
-Told = Callable[[str, "float | Link | Claim"], None]
-"""Callback that takes the token of a ruler, and the width of its window, CSS pixels, the link's wish, or a key."""
+class Window(msgspec.Struct, frozen=True):
+    """Report of a page on its browser window."""
+
+    width: Annotated[int, msgspec.Meta(ge=NARROWEST, le=WIDEST)]  # CSS pixels
+    link: Link | None = None
+    """What the page's address asked for; None if nothing, and in later reports."""
+    key: Annotated[str, msgspec.Meta(max_length=LONGEST)] = ""
+    """Presenter's key; empty if the page has none, and in later reports."""
 
 
-class Ruler:
-    """Measures the window of one visitor, and reads its link."""
+def report_window(client: viser.ClientHandle, act: Callable[[Window], None], kinds: Sequence[Kind] = ()) -> None:
+    """Have a page report its window when it is shown, and when its width changes.
 
-    def __init__(self) -> None:
-        self.token = secrets.token_urlsafe(12)
-        """Name of this ruler in requests, which nobody else knows."""
+    Args:
+        client: visitor whose page it is.
+        act: called with each valid report, on the server's event loop; it must only submit.
+        kinds: kinds of links that are read; others stay in the address.
+    """
 
-    @property
-    def html(self) -> str:
-        """What is to stand on the page, unseen."""
-        return self._measures(KINDS)
+    def reported(text: str) -> None:
+        try:
+            window = msgspec.json.decode(text, type=Window)
+        except (msgspec.MsgspecError, UnicodeError):
+            return
+        act(window)
 
-    @property
-    def asking_html(self) -> str:
-        """HTML that measures the window and tells the presenter's key; the rest of the link stays in the address."""
-        return self._measures(()) + _run(PRESENT.replace("ADDRESS", f"{FOLDER}/{self.token}"))
-
-    def _measures(self, kinds: Sequence[str]) -> str:
-        return _run(MEASURE.replace("ADDRESS", f"{FOLDER}/{self.token}").replace("KINDS", str([*kinds])))
-
-
-@dataclass(frozen=True)
-class Claim:
-    """The claim to be the presenter."""
-
-    key: str
-
-
-def told(path: str) -> tuple[str, float | Link | Claim] | None:
-    """Return the token, and the width, CSS pixels, the link or the key of a request's path; None if it has none."""
-    claimed = re.search(rf"/{FOLDER}/([\w-]+)/present/([\w-]{{1,{LONGEST}}})$", path, re.ASCII)
-    if claimed:
-        return claimed[1], Claim(claimed[2])
-    asked = re.search(rf"/{FOLDER}/([\w-]+)/({'|'.join(KINDS)})/([\w.!~*'()%-]{{0,{LONGEST}}})$", path, re.ASCII)
-    if asked:
-        return asked[1], Link(asked[2], unquote(asked[3])[:LONGEST])
-    found = re.search(rf"/{FOLDER}/([\w-]+)/(\d{{3,5}})$", path, re.ASCII)
-    return (found[1], float(found[2])) if found and NARROWEST <= int(found[2]) <= WIDEST else None
+    script = REPORT.replace("KINDS", json.dumps([*kinds])).replace("LONGEST", str(LONGEST))
+    with client.atomic():
+        client.gui.add_html(patches.UNSEEN + _run(script))
+        Control(client.gui.add_text("Window", ""), reported)
 
 
 def drop_html(button: viser.GuiUploadButtonHandle, most: int) -> str:

@@ -9,34 +9,31 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from types import MappingProxyType
 from typing import NoReturn
 
 import viser
 
-from dt_viz.accounts import Accounts
 from dt_viz.errors import UnwantedError
 from dt_viz.learning.store import FitStore
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.saved import Saved
 from dt_viz.scenario.tasks import TaskEntry
-from dt_viz.serving.board import Share, own_share
-from dt_viz.serving.listening import listen
+from dt_viz.serving.board import Share
+from dt_viz.serving.supervisor import listen
 from dt_viz.session.arms import ArmStore
-from dt_viz.ui.gate import Gate, Limits
+from dt_viz.ui.gate import LAST_WORDS, Gate, Origins
 from dt_viz.ui.keeping import KEY
-from dt_viz.ui.origins import Origin, Origins
-from dt_viz.ui.panel import MAX_UPLOAD
 from dt_viz.ui.presenting import TAKEN, WRONG, Lecture, Viewer
-from dt_viz.ui.scripts import Claim, Link, forget_html
+from dt_viz.ui.scripts import forget_html
 from dt_viz.ui.tabs.status import COLOURS
 from dt_viz.ui.visitor import Visitor, notify
 from dt_viz.warning import Severity
 
 logger = logging.getLogger(__name__)
 
-MAX_WAITING = 8
-"""Largest number of visitors who wait for a place, unless it is chosen."""
+MAX_WAITING = 8  # largest number of visitors who wait for a place, unless it is chosen
 IDLE = 600.0
 """Time after which the arm of a visitor who does nothing rests, and he gives his place to one who waits, seconds."""
 NEGLECTED = 30.0
@@ -67,7 +64,7 @@ class Server:
         max_sessions: int = 8,
         max_waiting: int = MAX_WAITING,
         max_of_address: int | None = None,
-        allowed: Sequence[Origin] = (),
+        allowed: Sequence[str] = (),
         key: str | None = None,
         begins: Saved | None = None,
         scenarios: Mapping[str, Saved] = MappingProxyType({}),
@@ -87,7 +84,7 @@ class Server:
             max_waiting: largest number of those who wait; any more are refused.
             max_of_address: largest number of visitors, also waiting ones, of one address; None is half of all, and all
                 with a key, as a lecture hall may have one address.
-            allowed: origins of other pages that may connect; see `Origins`.
+            allowed: origins of other pages that may connect, as of `origin_of`.
             key: makes all visitors watch the one who has it; see `Lecture`. Without one each has a private scene.
             begins: scenario of each new visitor, whose names these tasks and arms have; None is as the task begins.
             scenarios: scenarios that links may name, such as `/?scenario=lesson-1`, with such names, too.
@@ -98,7 +95,6 @@ class Server:
         """
         listening = listening or listen(host, port)
         titles, arms = {name: entry.title for name, entry in tasks.items()}, ArmStore(tasks, fits, robot)
-        accounts = Accounts()
         self._new_visitor: Callable[[viser.ClientHandle], Visitor] = lambda client: Visitor(
             client,
             arms.engine(),
@@ -107,7 +103,6 @@ class Server:
             task,
             arms,
             self._share,
-            accounts.opened(self.gate.address(client)),
             begins,
             scenarios,
             lambda: self._closed or client.client_id not in self._visitors,
@@ -122,11 +117,11 @@ class Server:
         self._closed = False
         connections = max_sessions + max_waiting
         most = max(2, connections // 2) if key is None else connections
-        limits = Limits(max_sessions, connections, upload=MAX_UPLOAD, of_address=max_of_address or most)
-        self._share = share or own_share(connections)
-        self.gate = Gate(Origins(host, allowed), limits, _refuse, self._told, self._share)
+        self._share, origins, most = share or Share(1, connections), Origins(host, allowed), max_of_address or most
+        refuse = partial(notify, colour=COLOURS[Severity.ALARM][0])
+        self.gate = Gate(listening, origins, max_sessions, connections, most, refuse, self._share)
         self._lecture = None if key is None else Lecture(key, host, self.gate.page)
-        self._server = self.gate.open(listening, "DT-Viz")
+        self._server: viser.ViserServer = self.gate.server
         self.host, self.port = host, self._server.get_port()
         self._server.gui.configure_theme(show_logo=False, show_share_button=False)
         self._server.on_client_connect(self._welcome)
@@ -161,7 +156,7 @@ class Server:
             for _, said, came in self._waiting.values():
                 if said is not None:
                     said.content = self._full(came)
-        if self._lecture is None and self._share.num_waiting and self._share.num_visitors >= self.gate.limits.places:
+        if self._lecture is None and self._share.num_waiting and self._share.num_visitors >= self.gate.places:
             quietest = max(self.visitors, key=lambda visitor: self.gate.idle(visitor.client), default=None)
             if quietest is not None and self.gate.idle(quietest.client) > IDLE:
                 notify(quietest.client, LEAVING, COLOURS[Severity.WARNING][0])
@@ -172,7 +167,7 @@ class Server:
         num_before = self._share.num_before(came)
         line = f"**{num_before} before you.** " if num_before else "**You are next.** "
         return (
-            f"**All {self.gate.limits.places} places are taken.** {line}This page opens by itself when a place is "
+            f"**All {self.gate.places} places are taken.** {line}This page opens by itself when a place is "
             "free: close another tab of this demo, or wait. Whoever runs the server can allow more with "
             "`--max-sessions`."
         )
@@ -183,8 +178,10 @@ class Server:
         self._share.close()
         if self._lecture is not None:
             self._lecture.close()
-        for client in self._server.get_clients().values():
+        clients = self._server.get_clients().values()
+        for client in clients:
             notify(client, CLOSING, COLOURS[Severity.WARNING][0])
+        notified = time.monotonic()
         with self._lock:
             self._closed = True
             self._lock.wait_for(lambda: not self._num_building, patience)  # a page that is being built needs the server
@@ -193,6 +190,8 @@ class Server:
             visitor.close()
         for visitor in visitors:  # and so does what they are drawing
             visitor.session.jobs.wait_idle(timeout=patience)
+        if clients:
+            time.sleep(max(0.0, notified + LAST_WORDS - time.monotonic()))  # until the notice is sent
         self._server.stop()
 
     def _welcome(self, client: viser.ClientHandle) -> None:
@@ -200,16 +199,15 @@ class Server:
             if self._closed or client.client_id not in self._server.get_clients():
                 return  # left before its turn came
             came = time.monotonic()
-            is_full = self._share.num_visitors + self._share.num_before(came) >= self.gate.limits.places
+            is_full = self._share.num_visitors + self._share.num_before(came) >= self.gate.places
             said = client.gui.add_markdown(self._full(came)) if is_full else None
             self._waiting[client.client_id] = client, said, came
             self._tell()
             if self._lecture is not None:
-                self._lecture.ask(client)
+                self._lecture.ask(client, partial(self._claimed, client))
         self._admit()
 
     def _tell(self) -> None:
-        """Tell other processes who is here."""
         self._share.seat(len(self._visitors), [came for *_, came in self._waiting.values()])
 
     def _admit(self) -> None:
@@ -217,7 +215,7 @@ class Server:
         with self._lock:
             if self._closed or not self._waiting:
                 return
-            with self._share.next_place(self.gate.limits.places) as is_free:
+            with self._share.next_place(self.gate.places) as is_free:
                 if not is_free:
                     return
                 client, said, _ = self._waiting.pop(next(iter(self._waiting)))
@@ -245,13 +243,11 @@ class Server:
         with self._lock:
             if self._closed or client.client_id not in self._server.get_clients():
                 return
-            _, said, _ = self._waiting.pop(client.client_id, (client, None, 0.0))
+            self._waiting.pop(client.client_id, None)
             self._visitors[client.client_id] = None
             self._tell()
             self._num_building += 1
         try:
-            if said is not None:
-                said.remove()
             before = lecture.take(self._server, viewer)
             if before is not None:
                 notify(before, TAKEN, COLOURS[Severity.WARNING][0])
@@ -280,26 +276,19 @@ class Server:
                 return
         visitor.close()  # left while the page was being built
 
-    def _told(self, token: str, what: float | Link | Claim) -> None:
-        if isinstance(what, Claim):
-            self._claimed(token, what.key)
+    def _claimed(self, client: viser.ClientHandle, key: str) -> None:
+        """Let a client with the right key present, beside the server's event loop; disconnect one with a wrong key."""
+        if self._lecture is None:
             return
-        if self._lecture is not None and not isinstance(what, Link):
-            self._lecture.measured(token, what)
-        for visitor in self.visitors:
-            if visitor.ruler.token == token:
-                visitor.told(what)
-
-    def _claimed(self, token: str, key: str) -> None:
-        """Let whoever has told the key present, beside the server's event loop."""
-        viewer, is_right = (None, False) if self._lecture is None else self._lecture.claimed(token, key)
+        viewer, is_right = self._lecture.claimed(client, key)
         if viewer is None:
             return
         if is_right:
             threading.Thread(target=self._present, args=(self._lecture, viewer), name="presenting").start()
         else:
-            notify(viewer.client, WRONG, COLOURS[Severity.WARNING][0])
-            viewer.client.gui.add_html(forget_html())
+            notify(client, WRONG, COLOURS[Severity.WARNING][0])
+            client.gui.add_html(forget_html())
+            self.gate.disconnect(client)
 
     def _farewell(self, client: viser.ClientHandle) -> None:
         with self._lock:
@@ -311,7 +300,3 @@ class Server:
         if visitor is not None:
             visitor.close()
         self._admit()
-
-
-def _refuse(client: viser.ClientHandle, text: str) -> None:
-    notify(client, text, COLOURS[Severity.ALARM][0])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -12,12 +12,11 @@ from types import MappingProxyType
 
 import numpy as np
 import viser
+from PIL import Image
 
-from dt_viz.accounts import Account
 from dt_viz.errors import Cancelled, DataError, FormatError, end_if, never
-from dt_viz.files.uploads import keep_ready, let_go
 from dt_viz.obstacles.shapes import TriangleObstacle, as_point
-from dt_viz.pictures.video import check_installed
+from dt_viz.pictures.video import VIDEO_SUFFIXES, ffmpeg
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.own import Own
 from dt_viz.scenario.relocation import in_world
@@ -25,44 +24,50 @@ from dt_viz.scenario.saved import Known, Saved, Sight, encode, is_saved
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.stack import with_avoidance
-from dt_viz.scenario.tasks import TASKS, Task
+from dt_viz.scenario.tasks import OWN, TASKS, Task
+from dt_viz.scheduler import SCHEDULER, Rank
 from dt_viz.serving.board import Share
 from dt_viz.session.arms import ArmStore
 from dt_viz.session.comparison import OTHERS
-from dt_viz.session.cores import CORES, Rank
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.opening import Preview
 from dt_viz.session.progress import Display, Pace, Progress
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import EDITS
-from dt_viz.ui.counting import Counted
 from dt_viz.ui.keeping import Keeper
 from dt_viz.ui.panel import ControlPanel
 from dt_viz.ui.pen import Pen
 from dt_viz.ui.playback import Playback, Replay
-from dt_viz.ui.scene.camera import CameraController, Framing, Pose, shot_beside, shot_of, view_of
-from dt_viz.ui.scene.export import RESOLUTIONS, TIMEOUT, render_frame, render_png
-from dt_viz.ui.scene.film import MOTION, SETTINGS, TURNTABLE, Film, Rendering, encoded, motion, turntable, warping
-from dt_viz.ui.scene.key import Key
+from dt_viz.ui.scene.camera import CameraController, Framing, Pose, Shot, shot_beside, shot_of, turned_shot, view_of
+from dt_viz.ui.scene.export import (
+    BROWSER,
+    LOOK,
+    MOTION,
+    SETTINGS,
+    TIMEOUT,
+    TIMEOUT_ALONE,
+    TURNTABLE,
+    WARP,
+    Order,
+    Studio,
+    as_png,
+    awaited,
+    filmed,
+    rendered,
+)
+from dt_viz.ui.scene.figure import Step, ignored
 from dt_viz.ui.scene.legend import Legend, legend_in
 from dt_viz.ui.scene.palette import DARK, LIGHT, Colour, Theme
-from dt_viz.ui.scene.recording import record
+from dt_viz.ui.scene.picture import Key
+from dt_viz.ui.scene.recording import drawn
 from dt_viz.ui.scene.robot_scene import RobotScene
 from dt_viz.ui.scene.scene import ScenePictures
-from dt_viz.ui.scene.studio import Studio
-from dt_viz.ui.scene.waiting import BROWSER, LOOK, Worker
-from dt_viz.ui.scripts import Link, Ruler
-from dt_viz.ui.tabs.saving import Step
+from dt_viz.ui.scripts import KINDS, Window, report_window
 from dt_viz.warning import Severity
 
 BRIEF = 5.0
 """Time for which a notice lies over the scene whose text stays longer in the status line, seconds."""
-
-
-def initial_scenario(engine: Engine, name: str) -> Scenario:
-    """Return the scenario that a task begins with. Raises what `Engine.task` raises."""
-    return initial(engine.task(name))
 
 
 def initial(task: Task) -> Scenario:
@@ -81,7 +86,7 @@ def known_names(tasks: Collection[str], arms: Collection[str]) -> Known:
 def _takes_long(saved: Saved) -> bool:
     """Whether another arm, surfaces of obstacles, or a task are to be made for a scenario before it is shown."""
     shapes = any(isinstance(obstacle, TriangleObstacle) for obstacle in saved.scenario.obstacles)
-    return bool(saved.scenario.arm) or saved.own is not None or shapes
+    return bool(saved.scenario.arm) or saved.scenario.task.startswith(OWN) or shapes
 
 
 def pose_of(sight: Sight | None) -> Pose | None:
@@ -110,7 +115,6 @@ class Visitor(Display):
         task: str,
         arms: ArmStore | None = None,
         share: Share | None = None,
-        account: Account | None = None,
         begins: Saved | None = None,
         scenarios: Mapping[str, Saved] = MappingProxyType({}),
         cancelled: Cancelled = never,
@@ -118,15 +122,13 @@ class Visitor(Display):
         """Build the page for an engine of its own and start computing; there is one arm where there are no `arms`.
 
         Where the browser keeps nothing, the page `begins` with a scenario, or else as the task does; a link may name
-        one of the `scenarios`. Edits and pictures are counted in the `share` of this process, processor time in the
-        visitor's `account`.
+        one of the `scenarios`. Edits and pictures are counted in the `share` of this process.
 
         Raises:
             UnwantedError: it is cancelled before the page is built.
         """
-        self.client = client
-        self.shown: Frame | None = None
-        """The last drawn frame."""
+        self.client, self._share = client, share
+        self.shown: Frame | None = None  # the last drawn frame
         self._previews: bool | None = False  # None: what was seen is being learned, and stays until then
         """Whether takes are seen that are not learned yet, and whether they are being learned."""
         self._dress(LIGHT)
@@ -134,7 +136,7 @@ class Visitor(Display):
         titled = {"": robot.title} if arms is None else arms.titles
         self._keeper = Keeper(client.local_storage, known_names(titles, titled), self._made, begins)
         self._exchanging = threading.RLock()  # the arm is moved, drawn, and shown or hidden, by different threads
-        with CORES.slot(Rank.PAGE, cancelled), client.atomic():
+        with SCHEDULER.slot(Rank.FIRST_PICTURE, cancelled), client.atomic():
             self.pictures = ScenePictures(client.scene, robot, lambda: self.session)
             self.robot = RobotScene(client, robot, Playback(engine.arm, self._pose))
             self._studio = Studio(self.pictures, lambda: self.robot, self._changing)
@@ -145,20 +147,13 @@ class Visitor(Display):
                 titles,
                 robot,
                 titled,
-                lambda resolution, transparent, cancelled: self.render(
-                    RESOLUTIONS[resolution], transparent=transparent, cancelled=cancelled
-                ),
+                self.picture,
                 self._send,
                 partial(notify, client, seconds=BRIEF),
                 self._camera,
                 self._darken,
                 partial(self._preview, pen),
-                self._keeper.forget,
                 self._save,
-                self._record,
-                lambda what, suffix, resolution, step, cancelled: self.film(
-                    what, suffix, RESOLUTIONS[resolution], step, cancelled
-                ),
                 self._open,
                 pen,
                 client.local_storage,
@@ -167,26 +162,22 @@ class Visitor(Display):
             )
         begun = self._keeper.begun
         at_once = None if begun is None or _takes_long(begun) else begun.scenario
-        display = self if share is None else Counted(self, share)
-        self.session = Session(engine, initial_scenario, task, display, arms and arms.engine, at_once, account)
+        begins_like = lambda engine, name: initial(engine.task(name))  # noqa: E731
+        self.session = Session(engine, begins_like, task, self, arms and arms.engine, at_once)
         self._panel.connect(self.session)
         self._keeper.begin(self.session, self._resume)
         self._panel.tour.begin(self.session)
-        self.ruler = Ruler()
-        """What the visitor's window is measured with."""
-        self.robot.playback.begin(self.session.jobs, self.session.fail, CORES.between_hands)
-        keep_ready(self)
+        self.robot.playback.begin(self.session.jobs, self.session.fail)
 
     def measure(self) -> None:
-        """Have the browser measure its window from now on."""
-        self.client.gui.add_html(self.ruler.html)
+        """Have the page report its window and its link from now on."""
+        report_window(self.client, self.reported, KINDS)
 
-    def told(self, what: float | Link) -> None:
-        """Take the width of the window, CSS pixels, or begin what the link of the page asks for."""
-        if isinstance(what, Link):
-            self._panel.follow(self.session, what)
-        else:
-            self._camera.measured(what)
+    def reported(self, window: Window) -> None:
+        """Frame the scene for the window's width, and open what the page's link asks for."""
+        self._camera.measured(window.width)
+        if window.link is not None:
+            self._panel.follow(self.session, window.link)
 
     @property
     def headline(self) -> str:
@@ -201,6 +192,10 @@ class Visitor(Display):
     def draw(self, frame: Frame, pace: Pace) -> None:
         with self._studio.drawing:  # a video ends before what was edited meanwhile is drawn
             self._draw(frame)
+        if self._share is not None:
+            self._share.count("edits", pace.num_edits)
+            if frame.stage is Stage.ROLLOUTS:
+                self._share.answered(pace.latency)
 
     def _draw(self, frame: Frame) -> None:
         beside = tuple(panel.shown for panel in frame.pictures.panels)
@@ -238,23 +233,21 @@ class Visitor(Display):
 
     def close(self) -> None:
         """Stop all work: the visitor has left."""
-        let_go(self)
         self.session.close()
 
     def _made(self, tasks: Collection[str]) -> Saved:
         """What the visitor has made, beside the tour, with the task unless it is one of these."""
         pose = self._panel.tour.pose if self.session.visits else self._camera.chosen
-        scenario = self.session.own
-        own = None if scenario.task in tasks else Own.of(self.session.engines(scenario.arm).task(scenario.task))
-        lesson = self._panel.opening.lesson
-        return Saved(scenario, _sight(pose), own, None if own is not None and own.lesson == lesson else lesson)
+        scenario, lesson = self.session.own, self._panel.opening.lesson
+        task = self.session.engines(scenario.arm).task(scenario.task)
+        own = None if scenario.task in tasks else Own.of(task)
+        return Saved(scenario, _sight(pose), own, None if task.lesson == lesson else lesson)
 
     def _came_back(self, pose: Pose | None) -> None:
-        """Have the camera where it was before the tour, with the visitor's own scenario."""
+        """Have the camera where it was before the tour or Reset, with the visitor's own scenario."""
         self._keeper.go_on(Saved(self.session.own, _sight(pose)))
 
     def _resume(self, saved: Saved) -> None:
-        """Go on with what was saved, beside the server's event loop."""
         self._panel.resume(self.session, saved, self._keeper.go_on)
 
     def _save(self, session: Session) -> None:
@@ -296,7 +289,6 @@ class Visitor(Display):
         self._keeper.changed()
 
     def _end_preview(self) -> None:
-        """Show the motion again in place of takes."""
         self._previews = False
         with self.client.atomic():
             self.pictures.preview(None, 0)
@@ -331,7 +323,7 @@ class Visitor(Display):
             self.robot.adopt(self.session.scenario.view, self.pictures.look)
             self.robot.set_aside(self._previews is not False)
             self._panel.take(robot)
-        self.robot.playback.begin(self.session.jobs, self.session.fail, CORES.between_hands)  # and the one before ends
+        self.robot.playback.begin(self.session.jobs, self.session.fail)  # and the one before ends
         self._camera.reframe(arm_size=robot.size)
 
     @contextmanager
@@ -351,65 +343,41 @@ class Visitor(Display):
         self._dress(self._studio.theme)
         self._studio.paint()
 
-    def render(self, size: tuple[int, int], *, transparent: bool = False, cancelled: Cancelled = never) -> bytes:
-        """Render the scene as the visitor sees it, as a PNG of a width and height in pixels; see `render_png`.
+    def picture(self, order: Order, step: Step = ignored, cancelled: Cancelled = never) -> bytes:
+        """Return what is shown as the content of a file; while a video is made the robot waits, and an edit ends it.
 
         Raises:
+            FormatError: nothing is shown yet, there is no motion to film, it is edited meanwhile, or what draws or
+                encodes it is missing or fails.
             TimeoutError: the browser does not answer.
             UnwantedError: it is cancelled; the browser is not waited for.
         """
-        with self._studio.rendering(), Worker(cancelled, TIMEOUT) as worker:
-            shot, legends = self._camera.shot(size), self._legends
-            return worker.done(
-                lambda: render_png(self.client, size, shot, legends, 2 * TIMEOUT, transparent=transparent), BROWSER
-            )
+        if order.suffix in VIDEO_SUFFIXES:
+            return self._film(order, step, cancelled)
+        if order.suffix == ".png":
+            timeout = TIMEOUT_ALONE if order.alone else TIMEOUT
+            with self._studio.rendering():
+                (shot, _), legends = self._shot(order), self._legends
+                render = partial(rendered, self.client, order, shot, legends, 2 * timeout)
+                return awaited(lambda: as_png(render()), BROWSER, cancelled, timeout)
+        frame = self._something
+        follower = self.session.engines(frame.scenario.arm).follower
+        with self.session.engine.refining(cancelled):
+            return drawn(frame, order.suffix, follower, self._camera.chosen, step)
 
-    def render_alone(self, size: tuple[int, int], timeout: float, sight: Sight | None = None) -> bytes:
-        """Render the scene that is shown as `render` does, but framed in all of the picture; `timeout` in seconds.
+    def _shot(self, order: Order) -> tuple[Shot, float]:
+        """Return the camera of a picture, and the distance of what it looks at, metres."""
+        if not order.alone:
+            return self._camera.shot(order.size), self._camera.depth
+        if (pose := pose_of(order.sight)) is None:
+            frame, whole = self._something, Framing(order.size, panel=0.0, narrow=0)
+            shot = shot_of(pose := view_of(frame.task, whole, panels=[panel.shown for panel in frame.pictures.panels]))
+        else:
+            shot = shot_beside(pose, shot_of(pose).wxyz, Framing(), order.size)
+        return shot, float(np.linalg.norm(pose[1] - pose[0]))
 
-        With a `sight` it is what a camera that looks so shows beside the panel, in a window of the usual size.
-        """
-        self.robot.playback.advance(0.0)
-        self.client.flush()
-        with self._studio.rendering():
-            pose = pose_of(sight) or self._pose_alone(size)
-            shot = shot_of(pose)
-            if sight is not None:
-                shot = shot_beside(pose, shot.wxyz, Framing(), size)
-            return render_png(self.client, size, shot, self._legends, timeout, transparent=False)
-
-    def _pose_alone(self, size: tuple[int, int]) -> Pose:
-        """Pose of a camera that frames what is shown in all of a picture of a width and height in pixels."""
-        assert self.shown is not None
-        framing, panels = Framing(size, panel=0.0, narrow=0), [panel.shown for panel in self.shown.pictures.panels]
-        return view_of(self.shown.task, framing, panels=panels)
-
-    def film(
-        self,
-        what: str,
-        suffix: str,
-        size: tuple[int, int],
-        step: Step,
-        cancelled: Cancelled,
-        *,
-        alone: bool = False,
-    ) -> bytes:
-        """Make a video of what is shown, as `render` does; the robot waits meanwhile, and an edit ends it.
-
-        Args:
-            what: `MOTION`, `TURNTABLE` or `WARP`.
-            suffix: of the file, one of `VIDEO_SUFFIXES`.
-            size: width and height, pixels.
-            step: told which part is done.
-            cancelled: tells whether nobody wants it any more.
-            alone: frame what is shown in all of the picture, as `render_alone` does.
-
-        Raises:
-            FormatError: there is nothing to film, the scene is edited meanwhile, or ffmpeg is missing or fails.
-            TimeoutError: the browser does not answer.
-            UnwantedError: it is cancelled.
-        """
-        check_installed()
+    def _film(self, order: Order, step: Step, cancelled: Cancelled) -> bytes:
+        ffmpeg()
         deadline = time.monotonic() + SETTINGS.patience
         while not self.session.wait_idle(LOOK):
             step(0.0)
@@ -425,39 +393,31 @@ class Visitor(Display):
 
         with self._studio.drawing, self._filmed():
             end_if(ended)
-            if alone:
-                position, look_at = pose = self._pose_alone(size)
-                shot, depth = shot_of(pose), float(np.linalg.norm(look_at - position))
-            else:
-                shot, depth = self._camera.shot(size), self._camera.depth
-            film = self._film_of(what, self._something, Rendering(shot, self._legends), depth, ended)
-            render = lambda given: render_frame(self.client, size, given.shot, given.legends, 2 * SETTINGS.patience)  # noqa: E731
-            return encoded(film, render, suffix, size, step, ended)
+            frame, reel, (first, depth), legends = self._something, Replay(), self._shot(order), self._legends
+            reel.motion = frame.arm
+            if order.what != TURNTABLE and (frame.blocked or (order.what == MOTION and frame.arm is None)):
+                found = frame.blocked[0].text if frame.blocked else "none that the arm follows"
+                raise FormatError("the motion", found, "one that is shown")
 
-    def _film_of(self, what: str, frame: Frame, rendering: Rendering, depth: float, cancelled: Cancelled) -> Film:
-        """Return a film of a frame that is shown, whose middle is at a depth, metres, in its first rendering."""
-        reel, scenario = Replay(), self.session.scenario
-        reel.motion = frame.arm
+            def show(part: float) -> Callable[[], Image.Image]:
+                shot, names = first, legends
+                if order.what == TURNTABLE:
+                    shot = turned_shot(first, depth, 2 * np.pi * part)
+                else:
+                    if order.what == WARP:
+                        warped = self.session.engine.fine(replace(scenario, warp=part), ended)
+                        reel.motion = warped.arm
+                        with self.client.atomic():
+                            self.pictures.draw(warped)
+                        names = [*filter(None, [legend_in(warped, scenario.view.colour)]), *self.pictures.keys]
+                    reel.seek((SETTINGS.along if order.what == WARP else part) * reel.duration)
+                    with self._exchanging:
+                        self.robot.playback.film = reel
+                        self.robot.pose(time.monotonic(), self.pictures.look.tubes)
+                return partial(rendered, self.client, order, shot, names, 2 * SETTINGS.patience)
 
-        def pose() -> None:
-            with self._exchanging:
-                self.robot.playback.film = reel
-                self.robot.pose(time.monotonic(), self.pictures.look.tubes)
-
-        def draw(warp: float) -> Rendering:
-            warped = self.session.engine.fine(replace(scenario, warp=warp), cancelled)
-            reel.motion = warped.arm
-            with self.client.atomic():
-                self.pictures.draw(warped)
-            legend = legend_in(warped, scenario.view.colour)
-            return Rendering(rendering.shot, [*filter(None, [legend]), *self.pictures.keys])
-
-        if what == TURNTABLE:
-            return turntable(rendering, depth)
-        if frame.blocked or (what == MOTION and frame.arm is None):
-            found = frame.blocked[0].text if frame.blocked else "none that the arm follows"
-            raise FormatError("the motion", found, "one that is shown")
-        return motion(reel, rendering, pose) if what == MOTION else warping(reel, draw, pose)
+            seconds = {MOTION: min(reel.duration, SETTINGS.motion), TURNTABLE: SETTINGS.turn, WARP: SETTINGS.warp}
+            return filmed(show, seconds[order.what], order, step, ended)
 
     @contextmanager
     def _filmed(self) -> Iterator[None]:
@@ -480,7 +440,6 @@ class Visitor(Display):
 
     @property
     def _legends(self) -> list[Legend | Key]:
-        """What explains the colours of a picture."""
         legend = self._panel.show.legend
         return [*([] if legend is None else [legend]), *self.pictures.keys]
 
@@ -491,16 +450,6 @@ class Visitor(Display):
             raise FormatError("the scene", "nothing yet", "a scene that is shown")
         return self.shown
 
-    def _record(self, step: Step) -> bytes:
-        """Make a page that replays what is shown; raises FormatError where that is nothing yet."""
-        frame = self._something
-        return record(frame, self.session.engines(frame.scenario.arm).follower, self._camera.chosen, step)
-
     def _send(self, suffix: str, content: bytes) -> None:
-        self.client.send_file_download(f"{self._name}{suffix}", content, save_immediately=True)
-
-    @property
-    def _name(self) -> str:
-        """Name of files that are saved, without their suffix."""
-        scenario = self.session.scenario
-        return "-".join(filter(None, ("dt-viz", scenario.task, scenario.arm)))
+        name = "-".join(filter(None, ("dt-viz", self.session.scenario.task, self.session.scenario.arm)))
+        self.client.send_file_download(f"{name}{suffix}", content, save_immediately=True)

@@ -7,7 +7,7 @@ import pytest
 from scenes import changed
 
 from dt_viz.avoidance.arm import WholeArm
-from dt_viz.avoidance.arm_settings import WholeArmSettings
+from dt_viz.avoidance.arm_field import WholeArmSettings
 from dt_viz.avoidance.arm_solver import MARGIN_TOLERANCE, MAX_DURATION, ArmSolution
 from dt_viz.avoidance.lift import Lift
 from dt_viz.flows.diffeomorphisms import Identity
@@ -190,21 +190,14 @@ def test_with_nothing_near_the_arm_moves_undisturbed(case):
     np.testing.assert_allclose(far.p, far.q, rtol=0, atol=1e-13)
 
 
-def off_the_flow(case, obstacle):
-    """How far coarse motions are from where their own transform takes the undisturbed ones, metres at the hand."""
-    avoidance = changed(case.scenario, obstacles=obstacle).arm_avoidance
-    coarse = case.arm.avoiding(case.lifted, avoidance, LIVE.spacing, coarse=True)
-    exact = coarse.transform.inverse(case.arm.limits.inside(coarse.q))
-    hand = case.robot.end_effector
-    return np.linalg.norm(hand(coarse.p) - hand(exact), axis=1).max()
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_samples_between_the_integrated_ones_are_on_the_flow_too(case, seed):
     rng = np.random.default_rng(seed)
     at = as_point(case.middle.position + rng.uniform(-0.04, 0.04, 3))
     obstacle = Sphere(at, rng.uniform(0.08, 0.2)) if seed else Box(at, as_point(rng.uniform(0.06, 0.16, 3)))
-    assert off_the_flow(case, obstacle) < 1e-3
+    coarse, hand = case.avoiding(obstacle, coarse=True), case.robot.end_effector
+    exact = coarse.transform.inverse(case.arm.limits.inside(coarse.q))
+    assert np.linalg.norm(hand(coarse.p) - hand(exact), axis=1).max() < 1e-3
 
 
 def test_samples_between_the_integrated_ones_keep_the_joint_limits(engine, robot, initial):
@@ -259,72 +252,40 @@ def test_a_posture_that_is_pinned_beside_a_limit_or_beyond_it_is_put_inside_and_
     assert (solution.p > lower).all() and (arm.limits.inside(solution.q) >= lower).all()
 
 
-def test_where_no_way_is_free_that_is_said_and_the_exact_flow_is_made_once_and_is_the_one_that_is_shown(
-    push, monkeypatch
-):
-    """The duration that is reported is the one of the motion, also where the search ends."""
-    made, solver = [], push.arm._solver
-
-    def recorded(*arguments, coarse):
-        made.append(coarse)
-        return solver(*arguments, coarse=coarse)
-
-    monkeypatch.setattr(push.arm, "_solver", recorded)
+def test_where_no_way_is_free_that_is_said_and_the_motion_is_that_of_the_duration_that_is_said(push):
     solution = push.avoiding(Sphere((0.03, -0.13, 0.4), 0.22))
-    assert made == [True] * (len(made) - 1) + [False] and len(made) > 2
-    assert not solution.cleared
-    assert solution.duration <= MAX_DURATION
-    rows = slice(None, None, 20)
-    image = solution.transform.inverse(push.arm.limits.inside(solution.q[rows]))
-    np.testing.assert_allclose(image, solution.p[rows], rtol=0, atol=1e-5)
+    assert not solution.cleared and solution.duration <= MAX_DURATION
+    image = solution.transform.inverse(push.arm.limits.inside(solution.q[::20]))
+    np.testing.assert_allclose(image, solution.p[::20], rtol=0, atol=1e-5)
 
 
-class TestTwoObstacles:
+def test_opposed_ways_out_of_two_balls_become_one_only_where_one_posture_meets_both(push, monkeypatch):
     """Balls above and below the path of the push, one after the other."""
+    mean = push.nominal.task.mean_path
+    pair = tuple(Sphere(as_point(mean[k] + [0.0, 0.0, z]), 0.1) for k, z in ((45, 0.03), (57, -0.03)))
+    one, other = (push.avoiding(ball, coarse=True).detours[0].side for ball in pair)
+    assert one @ other < WholeArmSettings().opposed
+    solution, avoidance = push.avoiding(pair, coarse=True), changed(push.scenario, obstacles=pair).arm_avoidance
+    first, second = solution.detours
+    np.testing.assert_array_equal(first.side, second.side)
+    assert solution.cleared
+    monkeypatch.setattr(push.arm, "settings", WholeArmSettings(together=-1.0))  # no posture meets both
+    first, second = push.arm.avoiding(push.lifted, avoidance, LIVE.spacing, coarse=True).detours
+    assert first.side @ second.side < WholeArmSettings().opposed
+    hands = [push.robot.end_effector(p) for p in split(solution, solution.p)]
+    assert max(sharpest_turn(hand, 0.015) for hand in hands) < 90
 
-    @pytest.fixture(name="pair")
-    def _pair(self, push):
-        mean = push.nominal.task.mean_path
-        return tuple(Sphere(as_point(mean[k] + [0.0, 0.0, z]), 0.1) for k, z in ((45, 0.03), (57, -0.03)))
 
-    def first(self, push, *balls):
-        """The most promising way out of each ball (K, 3)."""
-        avoidance = changed(push.scenario, obstacles=balls).arm_avoidance
-        return np.array([found[0] for found in push.arm._sides(push.lifted, avoidance, (None,) * len(balls))])
-
-    def test_opposed_ways_out_of_what_one_posture_meets_become_one(self, push, pair):
-        one, other = (self.first(push, ball)[0] for ball in pair)
-        assert one @ other < WholeArmSettings().opposed
-        solution = push.avoiding(pair, coarse=True)
-        first, second = solution.detours
-        np.testing.assert_array_equal(first.side, second.side)
+def test_where_the_first_way_out_is_long_one_with_less_detour_is_taken(push, monkeypatch):
+    box = Box((0.275, -0.457, 0.134), (0.217, 0.225, 0.206), (-0.182, -0.899, 0.319, -0.238))
+    avoidance, detours = changed(push.scenario, obstacles=box).arm_avoidance, []
+    for limit in (np.inf, 0.0):
+        monkeypatch.setattr("dt_viz.avoidance.arm_solver.LONG", limit)
+        solution = push.arm.avoiding(push.lifted, avoidance, LIVE.spacing, coarse=True)
+        hand, before = push.robot.end_effector(solution.p), push.robot.end_effector(solution.q)
+        detours.append(np.linalg.norm(hand - before, axis=1).max())
         assert solution.cleared
-        hands = [push.robot.end_effector(p) for p in split(solution, solution.p)]
-        assert max(sharpest_turn(hand, 0.015) for hand in hands) < 90
-
-    def test_ways_out_that_are_alike_or_that_no_posture_meets_both_of_stay_as_they_are(self, push, pair, monkeypatch):
-        x, y, z = pair[0].position
-        for other, together in ((replace(pair[0], position=(x, y, z + 0.001)), 0.05), (pair[1], -1.0)):
-            monkeypatch.setattr(push.arm, "settings", WholeArmSettings(together=together))
-            alone = [self.first(push, ball)[0] for ball in (pair[0], other)]
-            np.testing.assert_array_equal(self.first(push, pair[0], other), alone)
-
-
-def test_where_the_first_way_out_is_long_the_one_with_the_least_detour_is_taken(push, monkeypatch):
-    box, found = Box((0.275, -0.457, 0.134), (0.217, 0.225, 0.206), (-0.182, -0.899, 0.319, -0.238)), []
-    avoidance = changed(push.scenario, obstacles=box).arm_avoidance
-    usual = push.arm.avoiding(push.lifted, avoidance, LIVE.spacing, coarse=True)
-    better = push.arm._better
-
-    def kept(tried, best):
-        found.extend([best, tried])
-        return better(tried, best)
-
-    monkeypatch.setattr("dt_viz.avoidance.arm_solver.LONG", 0.0)
-    monkeypatch.setattr(push.arm, "_better", kept)
-    least = push.arm.avoiding(push.lifted, avoidance, LIVE.spacing, coarse=True)
-    detours = [push.arm._detour(solution) for solution in found if solution.cleared]
-    assert least.cleared and push.arm._detour(least) == min(detours) < push.arm._detour(usual)
+    assert detours[1] < detours[0]
 
 
 @pytest.mark.parametrize("margin", [0.0, 0.01])

@@ -14,11 +14,8 @@ from laws.registry import (
     HAND,
     LIMITED,
     LIMITS,
-    PINS,
     REACH,
     ROBOT,
-    UP,
-    beside_hand,
     beside_limits,
     near_ready,
 )
@@ -30,8 +27,7 @@ from dt_viz.obstacles.shapes import Box, Sphere
 from dt_viz.robot.models import HOME
 
 seeds = st.integers(0, 2**32 - 1)
-STEP = 1e-5
-"""Of differences, rad."""
+STEP = 1e-5  # of differences, rad
 ESCAPES = {name: field for name, field in ARM_FIELDS.items() if isinstance(field, WholeArmField)}
 
 
@@ -83,31 +79,6 @@ class TestWholeArmField:
         assert np.abs(escape(near_ready(5))).max() > 0.01
         np.testing.assert_array_equal(pinned(near_ready(5)), 0)
         np.testing.assert_allclose(central_differences(pinned, near_ready(5), STEP), 0, rtol=0, atol=1e-13)
-
-    def test_the_contact_escapes(self, escape):
-        """The average contact, moved against V, moves along its own way out."""
-        q, h = near_ready(200), 1e-6
-        points = BODY.positions(ROBOT, q)
-        distance = escape.obstacles[0].signed_distance(points) - BODY.radius
-        weights = (occupancy(escape, points, escape.obstacles[0].radius) ** 2)[..., None]
-        weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
-        moved = (BODY.positions(ROBOT, q - h * escape(q)) - points) / h
-        contact = (weights * moved).sum(axis=1)
-        outward = points - escape._escape.sources[0]
-        outward = (weights * outward / np.linalg.norm(outward, axis=2, keepdims=True)).sum(axis=1)
-        touching = distance.min(axis=1) < 0
-        assert touching.sum() > 20
-        assert ((contact * outward).sum(axis=1)[touching] > 0).all()
-        assert (contact @ UP)[touching].mean() > 0.02
-
-    @pytest.mark.parametrize("diameter", [0.04, 0.15, 0.30])
-    @pytest.mark.parametrize("reach", [0.0133, 0.08, 0.2667])
-    def test_the_point_that_contacts_fan_out_from_is_out_of_reach(self, diameter, reach):
-        """There the direction turns over no distance at all, so no flow passes it."""
-        field = WholeArmField(ROBOT, BODY, (beside_hand(diameter=diameter),), UP[None], PINS, reach)
-        source = field._escape.sources[0]
-        assert field.obstacles[0].signed_distance(source) > reach + BODY.radius.max()
-        np.testing.assert_allclose(np.cross(source - np.array(field.obstacles[0].position), UP), 0, atol=1e-12)
 
 
 BOX = Box(HAND.position, (0.2, 0.1, 0.06), (0.8, 0.0, 0.6, 0.0))
@@ -169,13 +140,6 @@ class TestFlows:
 
     def pace(self, field):
         return 1.0 if isinstance(field, WholeArmField) else 0.05
-
-    def test_the_equal_steps_of_a_drag_come_near_the_adaptive_ones(self, field):
-        q, fine = near_ready(12), self.chain(field, 0.4).inverse(near_ready(12))
-        coarse = Conjugated(Flow(field, self.pace(field) * 0.4, 2), LIMITS)
-        np.testing.assert_allclose(coarse.inverse(q), fine, rtol=0, atol=0.02)
-        hand, miss = ROBOT.end_effector(fine), ROBOT.end_effector(coarse.inverse(q))
-        assert np.linalg.norm(hand - miss, axis=1).max() < 2e-3
 
     def test_no_flow_leaves_the_joint_limits(self, field):
         """Even if it wants to: the postures here begin beside a limit."""

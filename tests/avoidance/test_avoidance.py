@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scenes import avoiding
 
-from dt_viz.avoidance.clearing import clearing_duration
+from dt_viz.avoidance.avoidance import clearing_duration
 from dt_viz.avoidance.hand import ACCEPTED_MARGIN, MAX_DURATION, SNAPSHOT, HandAvoidance
 from dt_viz.avoidance.transform import MotionBelow
 from dt_viz.flows.diffeomorphisms import Flow
@@ -35,19 +34,6 @@ def clearing(field, sphere, points, margin=MARGIN):
 
 def carried(field, points, duration):
     return Flow.adaptive(field, duration, 1e-9).inverse(points)
-
-
-def test_the_clearing_duration_needs_no_size_of_what_is_far_from_clear():
-    asked, field = [], SPHERE.field("free-space", 6.0)
-    points = np.array(SPHERE.position) + np.random.default_rng(0).uniform(-0.05, 0.05, (40, 3))
-
-    def cut_off(s, most):
-        asked.append(most)
-        return np.minimum(MARGIN - SPHERE.signed_distance(s), most)
-
-    duration = clearing_duration(field, points, cut_off, SNAPSHOT, MAX_DURATION)
-    assert duration is not None and 0 < duration == clearing(field, SPHERE, points)
-    assert len(asked) > 4 and np.isinf(asked[-2:]).all() and max(asked[:-2]) < 1e-3  # only the last ones are measured
 
 
 @given(seeds, st.sampled_from([1.0, 6.0, 20.0]))
@@ -110,12 +96,6 @@ def test_the_duration_hardly_depends_on_where_a_path_is_sampled(seed, miss, phas
     assert duration(coarse) == pytest.approx(duration(np.linspace(coarse[0], coarse[-1], 8000)), rel=0.02)
 
 
-def test_what_is_off_or_has_nothing_to_lead_around_is_not_in_the_stack():
-    assert [layer.name for _, layer in avoiding("any", SPHERE).active] == ["Avoidance"]
-    for changes in ({"avoids": False}, {"obstacles": ()}, {"space": "cspace"}):
-        assert avoiding("any", **{"obstacles": SPHERE, **changes}).active == ()
-
-
 def test_a_chosen_duration_is_taken_as_it_is():
     before, chosen = motion(passing_points(1)), replace(AVOIDANCE, duration=0.123)
     before = replace(before, earlier=AVOIDANCE.build(before))
@@ -139,15 +119,6 @@ def test_a_covered_start_that_leaves_at_once_asks_for_no_way_out():
     away = np.array(SPHERE.position) + np.linspace(0.95, 4, 40)[:, None] * SPHERE.radius * np.eye(3)[0]
     built = AVOIDANCE.build(motion(away))
     assert built.detours == (None,) and built.duration == 0 and len(built.warnings) == 1
-
-
-def test_another_attempt_keeps_the_way_out_and_the_flow_along_it():
-    before = motion(passing_points(1), passing_points(2))
-    first = AVOIDANCE.build(before)
-    moved = replace(before, positions=first.transform.forward(before.positions), earlier=first)
-    again = AVOIDANCE.build(moved)
-    assert first.sideways and again.sideways is first.sideways and again.detours is first.detours
-    assert again.duration >= first.duration
 
 
 def test_the_margin_changes_gradually_where_an_obstacle_comes_over_a_start():

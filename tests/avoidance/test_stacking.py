@@ -4,15 +4,13 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from scenes import avoiding, beside, biases, changed, frame_at
+from scenes import avoiding, biases, changed, frame_at
 
 from dt_viz.avoidance.bias import MAX_TARGET_MISS, BiasPoint
 from dt_viz.avoidance.hand import Avoidance, HandAvoidance
 from dt_viz.avoidance.page import Choice, FlowIntegration, Number, Switch
-from dt_viz.avoidance.placement import PLACED_BESIDE, bias_beside
-from dt_viz.avoidance.registry import BIAS, KINDS
+from dt_viz.avoidance.registry import BIAS, KINDS, PLACED_BESIDE, bias_beside
 from dt_viz.flows.diffeomorphisms import Integration
-from dt_viz.motion.stack import LIVE, build_stack
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.scenario import Layer, Scenario, View
 from dt_viz.scenario.stack import (
@@ -42,7 +40,6 @@ QUICK = ("draw_s", "draw_8", "push_box")
 PLACES = ((0.1, -0.5, 0.4), (0.2, -0.5, 0.4), (0.3, -0.5, 0.4))
 SPHERE = Sphere((0.0, -0.5, 0.4))
 AVOIDANCE = KINDS[HandAvoidance].title
-EULER = Integration("euler", 3)
 
 
 def stack(num=3, **changes):
@@ -91,30 +88,6 @@ def test_layers_are_added_below_avoidance_only_while_that_is_outermost_and_move_
     for idle in (stack(space="cspace", level=2), changed(stack(level=2), obstacles=())):
         assert listed(moved(idle, "Bias 3", 1)) == ("Bias 1", "Bias 2", "Bias 3")
         assert listed(moved(idle, "Bias 3", -1)) == ("Bias 1", "Bias 3", "Bias 2")
-
-
-def test_each_transform_is_told_the_targets_below_it_that_are_on(engine, monkeypatch):
-    told, build = {}, BiasPoint.build
-
-    def listening(self, motion):
-        told[motion.name] = motion.targets
-        return build(self, motion)
-
-    def targets(scenario):
-        told.clear()
-        build_stack(engine.nominal(scenario), scenario.active, LIVE)
-        return dict(told)
-
-    monkeypatch.setattr(BiasPoint, "build", listening)
-
-    first = (0.5, 0.0, 0.0)
-    points = [BiasPoint(place, strength=0.0) for place in (first, *PLACES[1:])]
-    scenario = changed(stack(), layers=biases(*points))
-    off = replace(scenario, stack=switched(scenario, "Bias 2"))
-    assert [layer.on for layer in beside(off)] == [True, False, True]
-    assert targets(off) == {"Bias 1": (), "Bias 3": (first,)}
-    down = moved(scenario, "Bias 3", -1)
-    assert targets(down) == {"Bias 1": (), "Bias 3": (first,), "Bias 2": (first, PLACES[2])}
 
 
 @pytest.mark.parametrize(
@@ -220,21 +193,6 @@ def test_transforms_are_listed_from_the_outermost_inwards_and_the_chosen_one_is_
     assert tuned(chosen) == "Bias 2"
     assert tuned(replace(chosen, stack=without(chosen, "Bias 2"))) == WHOLE_ARM
     assert chosen.computes_like(TUNED)
-
-
-@pytest.mark.parametrize("name", tunable(TUNED)[:-1])
-def test_what_is_set_is_what_is_read_and_the_others_stay(name):
-    before = {other: transform_of(TUNED, other) for other in tunable(TUNED)}
-    own = before[name]
-    assert isinstance(own, Avoidance | BiasPoint)
-    after = replace(own, integration=EULER)
-    edited = replace(TUNED, stack=with_transform(TUNED, name, after))
-    for other, transform in before.items():
-        assert transform_of(edited, other) == (after if other == name else transform)
-    assert replace(edited, stack=TUNED.stack) == TUNED
-    assert listed(edited) == listed(TUNED)
-    assert edited.arm_avoidance is not None
-    assert (edited.arm_avoidance.integration == EULER) == (name == WHOLE_ARM)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -1,15 +1,19 @@
-"""EFlow beside the laws of its layers (tests/laws): motions that are those of its velocity, stable by construction."""
+"""EFlow beside the laws of its layers (tests/laws): stable by construction, and with a repulsion within its range."""
 
 import numpy as np
 import pytest
 from oracles import central_differences, stepped
 from plans import eflow_weights as weights
 
+from dt_viz.baselines import repulsive
 from dt_viz.baselines.eflow import EFlowSystem, load_system
+from dt_viz.baselines.repulsive import RepulsivePlanner, repulsion
 from dt_viz.evaluate.held_out import frechet
 from dt_viz.flows.diffeomorphisms import round_trip_error
+from dt_viz.motion.stack import LIVE
+from dt_viz.obstacles.shapes import Sphere, as_point
+from dt_viz.obstacles.union import Union
 from dt_viz.scenario.tasks import TASKS
-from dt_viz.shipped import ASSETS
 
 NAMES = ("draw_s", "push_box")
 
@@ -62,7 +66,7 @@ def test_motions_from_perturbed_starts_reach_the_goal_and_rest_while_the_potenti
 
 def test_numpy_computes_what_torch_is_trained_on(task, exact, points):
     torch = pytest.importorskip("torch")
-    from dt_viz.baselines.eflow_training import velocity
+    from assets.eflow_training import velocity
 
     arrays = {name: torch.tensor(array) for name, array in weights(task).items()}
     x = exact.normalised(points)
@@ -76,29 +80,9 @@ def test_numpy_computes_what_torch_is_trained_on(task, exact, points):
     assert np.abs(found).max() > 0.01
 
 
-def test_the_gradient_that_training_follows_is_that_of_finite_differences(task):
-    torch = pytest.importorskip("torch")
-    from dt_viz.baselines.eflow_training import velocity
-
-    arrays = {name: torch.tensor(array) for name, array in weights(task).items()}
-    w, rng = arrays["weights"], np.random.default_rng(3)
-    dim = task.demonstrations[0].dimension
-    x, goal = torch.tensor(rng.uniform(-0.5, 0.5, (20, dim))), torch.zeros(dim, dtype=w.dtype)
-    along, h = torch.tensor(rng.normal(size=w.shape)), 1e-6
-
-    def size(weights):
-        return velocity(x, goal, arrays, {**arrays, "weights": weights}).square().sum()
-
-    (gradient,) = torch.autograd.grad(size(w.requires_grad_()), w)
-    with torch.no_grad():
-        slope = (size(w + h * along) - size(w - h * along)).item() / (2 * h)
-    assert (gradient * along).sum().item() == pytest.approx(slope, rel=1e-5)
-
-
 @pytest.mark.parametrize("name", TASKS)
-def test_shipped_weights_fit_their_task_reach_its_goal_and_are_small(name):
+def test_shipped_weights_fit_their_task_and_reach_its_goal(name):
     task, system = TASKS[name](), load_system(TASKS[name]())
-    assert (ASSETS / "baselines" / f"eflow_{name}.npz").stat().st_size <= 1e6
     paths, times = system.rollouts(task.starts, 0.012)
     assert max(np.linalg.norm(path[-1] - system.goal) for path in paths) < 1e-6
     lengths = [np.linalg.norm(np.diff(path, axis=0), axis=1).sum() for path in task.paths]
@@ -106,3 +90,72 @@ def test_shipped_weights_fit_their_task_reach_its_goal_and_are_small(name):
     assert follows == (name != "draw_8")  # which crosses itself, as no motion of one field does
     durations = [d.times[-1] - d.times[0] for d in task.demonstrations]
     assert not follows or 0.5 < np.mean([t[-1] for t in times]) / np.mean(durations) < 2
+
+
+# with a repulsion
+
+
+SPHERE = Union((Sphere((0.1, -0.5, 0.3), 0.15),))
+
+
+def at_distances(distances):
+    """Points (N, 3) at these distances from the sphere, in the direction x."""
+    return np.array(SPHERE.parts[0].position) + np.outer(0.075 + np.array(distances), [1.0, 0.0, 0.0])
+
+
+def test_the_repulsion_is_the_gradient_of_its_potential_up_to_a_bound_ends_at_its_range_and_leads_away_inside():
+    def potential(y):
+        return 0.5 * repulsive.GAIN * (1 / SPHERE.signed_distance(y) - 1 / repulsive.RANGE) ** 2
+
+    near = at_distances(np.array([0.9, 0.7, 0.5, 0.3]) * repulsive.RANGE)
+    expected = -central_differences(potential, near, 1e-5)
+    np.testing.assert_allclose(repulsion(SPHERE, near)[1], expected, rtol=1e-4, atol=1e-9)
+    distance, velocity = repulsion(SPHERE, at_distances([repulsive.RANGE + 1e-9, 2 * repulsive.RANGE, 1.0]))
+    np.testing.assert_allclose(distance, [repulsive.RANGE, 2 * repulsive.RANGE, 1.0])
+    assert not velocity.any()
+    np.testing.assert_allclose(repulsion(SPHERE, at_distances([-0.01, -0.05]))[1], [[repulsive.STRONGEST, 0, 0]] * 2)
+
+
+@pytest.fixture
+def push():
+    return TASKS["push_box"]()
+
+
+@pytest.fixture
+def planner(push):
+    arrays = weights(push, amplitude=0.003)
+    arrays["speed_2"][:, -1] -= 1.5  # as slow as a demonstration
+    system = EFlowSystem.of(push, arrays)
+    return RepulsivePlanner(system)
+
+
+def test_motions_that_stay_out_of_range_are_those_of_eflow(push, planner):
+    far = Union((Sphere((0.0, 0.0, 3.0), 0.15),))
+    paths, times = planner.system.rollouts(push.starts, LIVE.spacing)
+    plan = planner(far, push.starts)
+    assert all(np.array_equal(a, b) for a, b in zip((*plan.paths, *plan.times), (*paths, *times), strict=True))
+
+
+@pytest.fixture
+def beside(planner, push):
+    """An obstacle beside the first motion."""
+    (path,), _ = planner.system.rollouts(push.starts[:1], 0.012)
+    return Union((Sphere(as_point(path[len(path) // 2] + [0.0, 0.03, 0.03]), 0.06),))
+
+
+def test_steps_follow_the_sum_of_both_velocities_and_eflow_goes_on_after_them(push, planner, beside):
+    plan = planner(beside, push.starts[:1])
+    path, times = plan.paths[0], plan.times[0]
+    assert (np.diff(times) > 0).all()
+    stepped = np.flatnonzero(np.isclose(np.diff(times), 0.05, rtol=0, atol=1e-12))
+    assert len(stepped) > 10
+    alone, pushed = planner.system.velocity(path[stepped]), repulsion(beside, path[stepped])[1]
+    np.testing.assert_allclose(path[stepped + 1], path[stepped] + 0.05 * (alone + pushed), atol=1e-6)
+    assert np.abs(0.05 * pushed).max() > 1e-4
+    assert np.linalg.norm(path[-1] - planner.system.goal) < 1e-6
+
+
+def test_before_an_obstacle_on_the_goal_a_motion_stops(push, planner):
+    plan = planner(Union((Sphere(as_point(planner.system.goal), 0.1),)), push.starts[:2])
+    assert all(0.02 < np.linalg.norm(path[-1] - planner.system.goal) < 0.2 for path in plan.paths)
+    assert max(t[-1] for t in plan.times) < repulsive.LONGEST + 60

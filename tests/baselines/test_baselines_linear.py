@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from plans import joints_of
 
-from dt_viz.baselines import linear
-from dt_viz.baselines.postures import PlanningScene, Query, planned
+from dt_viz.baselines.postures import PlanningScene, Query, fit_straight, planned
 from dt_viz.obstacles.shapes import Box, Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.inverse_kinematics import UnreachableError
@@ -14,7 +13,7 @@ from dt_viz.robot.models import load_jaco
 
 
 def test_joints_go_straight_from_the_demonstrated_start_to_the_demonstrated_goal(problem):
-    plan = linear.fit(problem)(Union(), problem.task.starts)
+    plan = fit_straight(problem)(Union(), problem.task.starts)
     for i, (q, t) in enumerate(zip(joints_of(plan), plan.times, strict=True)):
         start, goal = problem.postures[i][[0, -1]]
         np.testing.assert_allclose(q, start + np.linspace(0, 1, len(q))[:, None] * (goal - start), atol=1e-9)
@@ -25,7 +24,7 @@ def test_joints_go_straight_from_the_demonstrated_start_to_the_demonstrated_goal
 
 def test_another_start_is_reached_by_inverse_kinematics_near_the_nearest_demonstration(problem):
     start = problem.task.starts[2] + np.array([0.0005, 0.001, 0.001])
-    plan = linear.fit(problem)(Union(), start[None])
+    plan = fit_straight(problem)(Union(), start[None])
     np.testing.assert_allclose(plan.paths[0][0], start, atol=1e-4)
     assert np.abs(joints_of(plan)[0][0] - problem.postures[2][0]).max() < 0.03
     np.testing.assert_array_equal(joints_of(plan)[0][-1], problem.postures[2][-1])
@@ -33,11 +32,11 @@ def test_another_start_is_reached_by_inverse_kinematics_near_the_nearest_demonst
 
 def test_a_start_out_of_reach_is_refused(problem):
     with pytest.raises(UnreachableError):
-        linear.fit(problem)(Union(), np.array([[2.0, 0.0, 0.5]]))
+        fit_straight(problem)(Union(), np.array([[2.0, 0.0, 0.5]]))
 
 
 def test_an_obstacle_changes_nothing(problem):
-    planner, start = linear.fit(problem), problem.task.starts[:1]
+    planner, start = fit_straight(problem), problem.task.starts[:1]
     free = planner(Union(), start)
     ball = Union((Sphere(as_point(free.paths[0][100]), 0.15),))
     np.testing.assert_array_equal(joints_of(free)[0], joints_of(planner(ball, start))[0])
@@ -90,16 +89,6 @@ class TestSurroundings:
             if verdicts[-1]:
                 assert self.depth(problem.robot, around.obstacle, *line) > 0
         assert 3 < sum(verdicts) < 27
-
-    @pytest.mark.long
-    def test_what_is_far_from_everything_is_free(self, problem, lines):
-        model = load_jaco().collision
-        far, nothing = (PlanningScene(problem.robot, Union(parts)) for parts in ((Sphere((5.0, 0.0, 0.0)),), ()))
-        for line in lines[:15]:
-            itself = model.nearest_to_itself(np.stack(line))
-            assert far.is_free(*line) == nothing.is_free(*line)
-            if self.depth(problem.robot, far.obstacle, *line) > 1e-3 and (itself is None or itself.distance > 0):
-                assert nothing.is_free(*line)
 
     @pytest.mark.long
     def test_nothing_between_two_samples_is_passed_through(self, problem, lines):

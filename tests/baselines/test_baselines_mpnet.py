@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from importlib.util import find_spec
-from itertools import pairwise
 from types import SimpleNamespace
 from typing import cast
 
@@ -11,17 +10,15 @@ import pytest
 from other_arms import OTHER_ARMS
 from plans import joints_of
 
-from dt_viz.baselines import linear, mpnet, mpnet_rrt
+from assets.mpnet_training import initial, loss_and_gradient, train
+from dt_viz.baselines import mpnet
 from dt_viz.baselines.base import NotFittedError
 from dt_viz.baselines.mpnet import ARCHITECTURE, Network, Search
-from dt_viz.baselines.mpnet_training import SETTINGS, initial, loss_and_gradient, steps, train
-from dt_viz.baselines.postures import PlanningScene
+from dt_viz.baselines.postures import PlanningScene, fit_straight
 from dt_viz.errors import UnwantedError
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.models import load_jaco
-from dt_viz.scenario.tasks import TASKS
-from dt_viz.shipped import ASSETS
 
 needs_ompl = pytest.mark.skipif(find_spec("ompl") is None, reason="ompl is an extra")
 
@@ -35,7 +32,7 @@ def weights(seed=0):
 @pytest.fixture(scope="module")
 def in_the_way(problem):
     """A ball on the straight way of the joints from the first start."""
-    straight = linear.fit(problem)(Union(), problem.task.starts[:1])
+    straight = fit_straight(problem)(Union(), problem.task.starts[:1])
     return Union((Sphere(as_point(straight.paths[0][100]), 0.15),))
 
 
@@ -52,44 +49,14 @@ def at(*values):
 
 
 class TestModel:
-    def test_dropout_leaves_out_the_asked_share_and_is_seeded(self):
-        model = Network.of(weights())
-        (first, again), other = (
-            (model.next(np.zeros(6), np.ones(6), np.random.default_rng(0)) for _ in range(2)),
-            (model.next(np.zeros(6), np.ones(6), np.random.default_rng(1))),
-        )
-        np.testing.assert_array_equal(first, again)
-        assert np.abs(first - other).max() > 1e-3
-        masks = model.masks(np.random.default_rng(0), 50)
-        for mask, width in zip(masks, ARCHITECTURE.hidden[:-1], strict=True):
-            assert mask.shape == (50, width)
-            assert set(np.unique(mask)) == {0, 1 / (1 - ARCHITECTURE.dropout)}
-            assert np.mean(mask == 0) == pytest.approx(ARCHITECTURE.dropout, abs=0.06)
-
-    @pytest.mark.parametrize("fit", [mpnet.fit, mpnet_rrt.fit])
+    @pytest.mark.parametrize("fit", [mpnet.fit, mpnet.fit_rrt])
     @pytest.mark.parametrize("arm", OTHER_ARMS)
     def test_for_another_arm_it_says_whose_weights_they_are(self, problem, fit, arm):
         with pytest.raises(NotFittedError, match=r"^trained for the JACO only$"):
             fit(replace(problem, robot=OTHER_ARMS[arm]()))
 
-    def test_all_weights_that_ship_take_a_megabyte(self):
-        files = list((ASSETS / "baselines").glob("*.npz"))
-        assert len(files) == 2 * len(TASKS) and sum(file.stat().st_size for file in files) < 1e6
-
 
 class TestSearch:
-    @pytest.mark.parametrize("num", [1, 2, 7, ARCHITECTURE.max_steps + 1])
-    def test_ends_when_the_two_ends_can_be_joined_or_after_its_steps(self, num):
-        asked = []
-        start, goal = at(0.0, 1.0)
-        way = search(lambda a, b: asked.append((a, b)) or len(asked) == num).bidirectional(start, goal)
-        assert len(way) == min(num, ARCHITECTURE.max_steps) + 2
-        assert way[0] is start and way[-1] is goal
-        # from both ends in turn: what was joined last lies next to each other
-        assert all(after[1] == before[0] for before, after in pairwise(asked))
-        joined = {asked[-1], asked[-1][::-1]}
-        assert any((a[0], b[0]) in joined for a, b in pairwise(way))
-
     def test_contraction_keeps_what_straight_lines_cannot_do_without(self):
         near = search(lambda a, b: abs(a - b) <= 1.0)
         assert [q[0] for q in near.contracted(at(0, 0.5, 1, 1.5, 2, 5, 5.5))] == [0, 1, 2, 5, 5.5]
@@ -110,7 +77,7 @@ class TestSearch:
 
 class TestPlanning:
     def test_where_the_straight_line_is_free_it_is_taken(self, problem):
-        straight = linear.fit(problem)(Union(), problem.task.starts[:2])
+        straight = fit_straight(problem)(Union(), problem.task.starts[:2])
         plan = mpnet.fit(problem)(Union(), problem.task.starts[:2])
         for a, b in zip(joints_of(plan), joints_of(straight), strict=True):
             np.testing.assert_allclose(a, b, atol=1e-9)
@@ -130,7 +97,7 @@ class TestPlanning:
 class TestRRT:
     @needs_ompl
     def test_its_motions_are_free_and_repeat(self, problem, in_the_way):
-        planner = mpnet_rrt.fit(problem)
+        planner = mpnet.fit_rrt(problem)
         first, second = (planner(in_the_way, problem.task.starts[:1]) for _ in range(2))
         (q,) = joints_of(first)
         np.testing.assert_array_equal(q, joints_of(second)[0])
@@ -143,7 +110,7 @@ class TestRRT:
 
     @needs_ompl
     def test_what_there_is_no_time_for_stays_in_collision_and_says_so(self, problem, in_the_way):
-        plan = mpnet_rrt.fit(problem, seconds=0.0)(in_the_way, problem.task.starts[:1])
+        plan = mpnet.fit_rrt(problem, seconds=0.0)(in_the_way, problem.task.starts[:1])
         assert load_jaco().collision.nearest_to_obstacle(joints_of(plan)[0], in_the_way).distance < 0
         assert "from 1 of 1 starts collide" in plan.warnings[0]
 
@@ -156,7 +123,7 @@ class TestRRT:
             calls.append(0)
             return len(calls) == len(alone) + 20
 
-        planner = mpnet_rrt.fit(problem)
+        planner = mpnet.fit_rrt(problem)
         with pytest.raises(UnwantedError):
             planner(in_the_way, problem.task.starts[:1], cancelled)
         assert len(calls) == len(alone) + 20
@@ -172,20 +139,6 @@ class TestTraining:
             beside = ({**arrays, name: arrays[name] + side * h * along} for side in (1, -1))
             ahead, behind = (loss_and_gradient(moved, x, y, np.random.default_rng(2))[0] for moved in beside)
             assert (slope * along).sum() == pytest.approx((ahead - behind) / (2 * h), rel=1e-4, abs=1e-9)
-
-    def test_a_single_demonstration_is_learned_from_in_both_directions(self, problem):
-        x, y, centre, scale = steps(replace(problem, postures=problem.postures[:1]))
-        assert len(x) == 2 * (SETTINGS.num_waypoints - 1)
-        there, back = np.split(x, 2)
-        np.testing.assert_allclose(centre + scale * there[0, :6], problem.postures[0][0], atol=1e-9)
-        np.testing.assert_allclose(centre + scale * there[0, 6:], problem.postures[0][-1], atol=1e-9)
-        np.testing.assert_allclose(back[0, 6:], there[0, :6])
-        np.testing.assert_allclose(y[:-1][: SETTINGS.num_waypoints - 2], there[1:, :6])
-
-    def test_a_demonstration_that_does_not_move_the_arm_is_refused(self, problem):
-        still = np.repeat(problem.postures[0][:1], 5, axis=0)
-        with pytest.raises(NotFittedError, match="does not move"):
-            steps(replace(problem, postures=(problem.postures[0], still)))
 
     @pytest.mark.long
     def test_what_training_returns_can_be_planned_with(self, problem):

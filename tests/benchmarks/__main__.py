@@ -22,9 +22,8 @@ NAMES = (
     "pictures",
     "fairness",
     "soak",
-    "capacity",
-    "webassembly",
     "documents",
+    "load",
 )
 PROG = "python -m tests.benchmarks"
 

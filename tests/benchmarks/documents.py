@@ -17,18 +17,15 @@ from itertools import chain, starmap
 from pathlib import Path
 from typing import Any
 
-from dt_viz.evaluate.options import TABLES, as_text
+from dt_viz.evaluate.options import as_text
 
-OUT = TABLES
 KEPT = Path(__file__).parent / "measured"
 """Folder of the rows from which the documents' tables are made, a file for each subject."""
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = (ROOT / "README.md", ROOT / "dt_viz" / "evaluate" / "README.md")
 Row = Mapping[str, Any]
-Result = tuple[str, Sequence[Row]]
-"""A command with its options, and the rows that it has printed."""
-Cell = tuple[str, str, str]
-"""Row and column of a document's table, and the text of that cell."""
+Result = tuple[str, Sequence[Row]]  # A command with its options, and the rows that it has printed
+Cell = tuple[str, str, str]  # row and column of a document's table, and the text of that cell
 LOAD = (
     "first picture s",
     "pictures/s of each",
@@ -162,7 +159,8 @@ def _of_reactive(results: Sequence[Result]) -> Iterator[Cell]:
 
 def _summed_up(measured: str, figure: str, command: str) -> Iterator[Cell]:
     yield measured, "figure", figure
-    yield measured, "command: `dt-viz evaluate …`", f"`{_short(command)} --out F`"
+    called = re.sub(r"^(?:python -m dt_viz\.evaluate|(python -m \S+)) .*", r"\1", command) or "dt-viz evaluate"
+    yield measured, "command", f"`{called} {_short(command)} --out F{Path(command.rsplit(maxsplit=1)[-1]).suffix}`"
 
 
 Table = Callable[[Sequence[Result]], Iterator[Cell]]
@@ -222,7 +220,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run the command."""
     if options.folder.resolve() != KEPT:
-        shutil.copytree(options.folder, KEPT, ignore=shutil.ignore_patterns("*.md", "arrays"), dirs_exist_ok=True)
+        shutil.copytree(options.folder, KEPT, ignore=shutil.ignore_patterns("arrays"), dirs_exist_ok=True)
     for document in DOCUMENTS:
         document.write_text(filled(document.read_text(encoding="utf-8")), encoding="utf-8")
     return 0

@@ -16,14 +16,13 @@ The npz file holds for each step, drag after drag:
     the sphere's centre, metres, and the number of the drag.
 ``moved`` (S, R)
     Fréchet distance from the frame before, metres; NaN for the first of a drag.
-``blocked`` (S,), ``seconds`` (S,)
-    whether there was no motion, and the time until the rollouts were ready.
+``blocked`` (S,)
+    whether there was no motion.
 """
 
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -36,6 +35,7 @@ from dt_viz.evaluate.options import (
     add_task,
     chosen_task,
     new_engine,
+    output,
     positive_number,
     report,
     whole_number,
@@ -46,17 +46,13 @@ from dt_viz.metrics import discrete_frechet, resample_by_arc_length
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.scenario.scenario import View
 from dt_viz.scenario.stack import avoiding
-from dt_viz.scenario.tasks import Task
+from dt_viz.scenario.tasks import Task, known_tasks
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Frame, Stage
 
-OUT = "FILE.npz"
-SPACE: Mapping[str, Space] = {"hand": "task", "arm": "cspace"}
-"""Spaces of the avoidance."""
-JUMP = 0.05
-"""Fréchet distance of a rollout from the one in the frame before beyond which it jumps, metres."""
-NUM_POINTS = 100
-"""Number N of points of a rollout."""
+SPACE: Mapping[str, Space] = {"hand": "task", "arm": "cspace"}  # spaces of the avoidance
+JUMP = 0.05  # fréchet distance of a rollout from the one in the frame before beyond which it jumps, metres
+NUM_POINTS = 100  # number N of points of a rollout
 REACH = 0.15
 """Distance from the mean demonstration at which random drags begin, and largest one at which they end, metres."""
 
@@ -65,14 +61,9 @@ REACH = 0.15
 class Drag:
     """What was measured along one drag."""
 
-    places: Array
-    """(S, 3) the sphere's centre, metres."""
-    rollouts: Array
-    """(S, R, N, 3), metres."""
-    blocked: Array
-    """(S,) bool."""
-    seconds: Array
-    """(S,) until the rollouts were ready."""
+    places: Array  # (S, 3) the sphere's centre, metres
+    rollouts: Array  # (S, R, N, 3), metres
+    blocked: Array  # (S,) bool
 
     @property
     def moved(self) -> Array:
@@ -84,6 +75,7 @@ class Drag:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the command's arguments."""
     add_task(parser)
+    parser.add_argument("--out", type=output(".npz"), required=True, metavar="FILE.npz", help="what is written")
     parser.add_argument("--avoid", choices=tuple(SPACE), default="arm", help="who gives way (default: %(default)s)")
     parser.add_argument("--drags", type=whole_number(1), default=5, help="(default: %(default)s)")
     parser.add_argument("--seed", type=whole_number(0), default=0, help="of these (default: %(default)s)")
@@ -93,16 +85,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run the command."""
-    tasks, task = chosen_task(options)
+    tasks, task = known_tasks(options.lasa), chosen_task(options)
     drags = [_measured(new_engine(tasks), task, places, options) for places in paths(task, options)]
     moved = [drag.moved for drag in drags]
-    write_npz(
-        options.out,
-        **{name: np.concatenate([getattr(d, name) for d in drags]) for name in ("rollouts", "places", "blocked")},
-        seconds=np.concatenate([d.seconds for d in drags]),
-        drag=np.repeat(np.arange(len(drags)), [len(d.places) for d in drags]),
-        moved=np.concatenate(moved),
-    )
+    arrays = {name: np.concatenate([getattr(d, name) for d in drags]) for name in ("rollouts", "places", "blocked")}
+    arrays |= {"moved": np.concatenate(moved)}
+    arrays["drag"] = np.repeat(np.arange(len(drags)), [len(d.places) for d in drags])
+    write_npz(options.out, arrays)
     print(f"{task.name}, {options.avoid} avoids, sphere of {options.diameter:g} m in steps of {options.step:g} m")
     by_name = {str(k): ([drag], [by]) for k, (drag, by) in enumerate(zip(drags, moved, strict=True))}
     report([_row(name, *of_row) for name, of_row in {**by_name, "all": (drags, moved)}.items()])
@@ -128,19 +117,15 @@ def _measured(engine: Engine, task: Task, places: Array, options: argparse.Names
     """Drag the sphere through places (S, 3), metres."""
     without = replace(avoiding(task, Avoidance()), view=View(field=False))
     rollouts = [_by_start(next(engine.frames(without)), task)]
-    blocked, seconds, passing = [], [], ANEW
+    blocked, passing = [], ANEW
     for place in places:
         avoidance = Avoidance(Sphere(as_point(place), options.diameter), space=SPACE[options.avoid])
         scenario = replace(avoiding(task, avoidance), view=View(field=False), passing=passing)
-        frames, began = engine.frames(scenario), time.perf_counter()
-        frame = next(frames)
-        seconds.append(time.perf_counter() - began)
-        while frame.stage < Stage.LIVE:
-            frame = next(frames)
+        frame = next(frame for frame in engine.frames(scenario) if frame.stage is Stage.LIVE)
         passing = frame.passing
         blocked.append(bool(frame.blocked))
         rollouts.append(rollouts[-1] if frame.blocked else _by_start(frame, task))
-    return Drag(places, np.stack(rollouts[1:]), np.array(blocked), np.array(seconds))
+    return Drag(places, np.stack(rollouts[1:]), np.array(blocked))
 
 
 def _by_start(frame: Frame, task: Task) -> Array:
@@ -160,5 +145,4 @@ def _row(name: str, drags: Sequence[Drag], moved: Sequence[Array]) -> Row:
         "frames in which a rollout jumps": jumps,
         "% of frames": 100 * jumps / frames,
         "largest step mm": 1e3 * float(np.nanmax(of_all, initial=0.0)),
-        "median ms": 1e3 * float(np.median(np.concatenate([drag.seconds for drag in drags]))),
     }

@@ -24,35 +24,28 @@ from zipfile import ZipFile
 
 import numpy as np
 
-from dt_viz.evaluate.load import started
-from dt_viz.evaluate.options import TABLES, Row, positive_number, report, whole_number
-from dt_viz.evaluate.protocol_client import LostError, ProtocolClient
-from dt_viz.evaluate.visit import SETTINGS, Visit, places_of
+from dt_viz.evaluate.options import Row, positive_number, report, whole_number
 from dt_viz.flows.fields import Array
 from dt_viz.scenario.scenario import MAX_OBSTACLES
 from dt_viz.scenario.tasks import TASKS
-from dt_viz.ui.tabs.picture import SAVE_PICTURE
-from dt_viz.ui.tabs.saving import CANCEL
-
-OUT = TABLES
+from dt_viz.ui.tabs.picture import CANCEL, SAVE_PICTURE
+from tests.benchmarks.load import started
+from tests.benchmarks.options import add_out
+from tests.benchmarks.visit import SETTINGS, Visit, places_of
+from tests.protocol_client import LostError, ProtocolClient
 
 
 @dataclass(frozen=True)
 class FairnessSettings:
     """What the other visitor does; times in seconds."""
 
-    task: str = "draw_s"
-    """Name of the task that both begin with."""
-    learned: str = "lift_box"
-    """Name of the task whose demonstrations, with noise, are learned."""
-    noise: float = 1e-3
-    """Standard deviation of that noise, metres."""
-    upload_every: float = 4.0
-    """Time from one upload to the next."""
+    task: str = "draw_s"  # name of the task that both begin with
+    learned: str = "lift_box"  # name of the task whose demonstrations, with noise, are learned
+    noise: float = 1e-3  # standard deviation of that noise, metres
+    upload_every: float = 4.0  # time from one upload to the next
     rings: tuple[int, int] = (375, 400)
     """Numbers of vertices around the two circles of the torus that is uploaded; it has twice their product of faces."""
-    begun: float = 5.0
-    """Time that the other one has to begin, and to come to rest when he does nothing any more."""
+    begun: float = 5.0  # time that the other one has to begin, and to come to rest when he does nothing any more
 
 
 OTHER = FairnessSettings()
@@ -60,10 +53,7 @@ OTHER = FairnessSettings()
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the command's arguments."""
-    parser.add_argument("--beside", choices=tuple(DOINGS), nargs="+", default=tuple(DOINGS), help="(default: all)")
-    parser.add_argument(
-        "--processes", type=whole_number(1), nargs="+", default=(1, 2), help="of the server, in turn (default: 1 2)"
-    )
+    add_out(parser)
     parser.add_argument("--seconds", type=positive_number("seconds", 3600), default=5.0, help="of a drag (default: 5)")
     parser.add_argument("--rounds", type=whole_number(1), default=6, help="(default: %(default)s)")
 
@@ -71,10 +61,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run the command; 1 if the first visitor was lost, or another one came to do nothing."""
     rows = []
-    for processes in options.processes:
+    for processes in (1, 2):
         server = ["--task", OTHER.task, "--processes", str(processes)]
-        for beside in options.beside:
-            with started(server) as (url, _):
+        for beside in DOINGS:
+            with started(server) as (url, *_):
                 rows.append({"processes": str(processes), **asyncio.run(_compared(url, beside, options))})
     report(rows)
     return 0 if all(row["done"] != "0" for row in rows) else 1
@@ -110,8 +100,7 @@ async def _compared(url: str, beside: str, options: argparse.Namespace) -> Row:
 
 async def _arrive(client: ProtocolClient) -> None:
     """Open the page, and wait until it rests. Raises LostError."""
-    await client.look()
-    if not await client.wait_for(lambda: client.has_picture, SETTINGS.first_picture):
+    if not await client.look_until_drawn(SETTINGS.first_picture):
         raise LostError("no picture in time")
     await asyncio.sleep(SETTINGS.settled)
 
@@ -154,7 +143,7 @@ class Other:
         """Upload a large mesh again and again, and take it away."""
         content = torus(*OTHER.rings)
         while True:
-            await self.client.set("History", "Reset")
+            await self.client.set("Reset", "Reset")
             await self.client.send_file("Mesh or point cloud", "torus.stl", content)
             self.num_done += 1
             await asyncio.sleep(OTHER.upload_every)
@@ -187,7 +176,7 @@ DOINGS: Mapping[str, Callable[[Other], Coroutine[Any, Any, None]]] = {
     "drags": Other.drag,
     "saves": Other.save,
 }
-"""What the other one does, by its name on the command line."""
+"""What the other one does, by its name in the table."""
 
 
 def torus(num_around: int, num_across: int) -> bytes:

@@ -15,17 +15,16 @@ from pathlib import Path
 import numpy as np
 
 from dt_viz.evaluate.held_out import NUM_COMPARED, frechet, shifted_to
-from dt_viz.evaluate.options import TABLES, Row, report
+from dt_viz.evaluate.options import Row, report
 from dt_viz.flows.fields import Array
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.demonstrations import Demonstration, load_demonstrations
 from dt_viz.learning.interface import AnyImitation
 from dt_viz.learning.state import learn
 from dt_viz.metrics import resample_by_arc_length
+from tests.benchmarks.options import add_out
 
-OUT = TABLES
-AWAY = (0.25, 0.5)
-"""Distances of starts from the mean one, relative to the extent of the demonstrations."""
+AWAY = (0.25, 0.5)  # distances of starts from the mean one, relative to the extent of the demonstrations
 PUSH, DRAWN = 0.2, 0.05
 """Length of a push, and distance up to which a place of the rest of a motion counts as drawn, of the extent."""
 
@@ -37,14 +36,12 @@ class OffCourse:
     name: str
     shape_error: tuple[float, ...]
     """Mean discrete Fréchet distance to the shifted mean demonstration, relative to the extent, for each of `AWAY`."""
-    speed: tuple[float, ...]
-    """Largest speed, relative to the fastest demonstrated."""
-    drawn: float
-    """Mean share of the rest of a motion that is still drawn after a push."""
+    drawn: float  # mean share of the rest of a motion that is still drawn after a push
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the command's arguments."""
+    add_out(parser)
     parser.add_argument("files", type=Path, nargs="+", metavar="SHAPE", help="as of evaluate imitation")
     parser.add_argument("--state", choices=("plain", "augmented"), default="plain", help="default: %(default)s")
 
@@ -59,7 +56,6 @@ def run(options: argparse.Namespace) -> int:
         {
             "shape": shape.name,
             **{f"shape error at {away:.0%}": error for away, error in zip(AWAY, shape.shape_error, strict=True)},
-            **{f"speed at {away:.0%}": speed for away, speed in zip(AWAY, shape.speed, strict=True)},
             "drawn after a push": shape.drawn,
         }
         for shape in found
@@ -76,9 +72,7 @@ def off_course(name: str, demonstrations: Sequence[Demonstration], imitation: An
     paths = [d.positions for d in demonstrations]
     extent = float(np.ptp(np.concatenate(paths), axis=0).max())
     mean = np.mean([resample_by_arc_length(path, 200) for path in paths], axis=0)
-    fastest = max(_fastest(d.times, d.positions) for d in demonstrations)
-    times = np.linspace(0, 3 * float(np.mean([d.times[-1] - d.times[0] for d in demonstrations])), 1500)
-    errors, speeds = [], []
+    errors = []
     across = np.linalg.svd(mean - mean.mean(axis=0))[2][:2]  # in space: in the plane that the mean is nearest to
     for away in AWAY:
         found = []
@@ -86,11 +80,10 @@ def off_course(name: str, demonstrations: Sequence[Demonstration], imitation: An
             start = mean[0] + away * extent * direction @ across
             system, state = imitation.system, imitation.system.base.states(start)
             (error,) = frechet([path_from(system, state, len(start))], [shifted_to(start, mean)])
-            found.append((error / extent, _fastest(times, system.rollout(state, times)[:, : len(start)]) / fastest))
-        errors.append(float(np.mean([error for error, _ in found])))
-        speeds.append(float(max(speed for _, speed in found)))
+            found.append(error / extent)
+        errors.append(float(np.mean(found)))
     drawn = [_drawn(imitation, d.positions[0], extent, across) for d in demonstrations[:3]]
-    return OffCourse(name, tuple(errors), tuple(speeds), float(np.mean(drawn)))
+    return OffCourse(name, tuple(errors), float(np.mean(drawn)))
 
 
 def path_from(system: DiffeomorphicSystem, state: Array, dim: int, num: int = NUM_COMPARED) -> Array:
@@ -103,10 +96,6 @@ def _directions(num: int) -> Array:
     """Unit vectors (num, 2) all around."""
     turn = np.linspace(0, 2 * np.pi, num, endpoint=False)
     return np.column_stack([np.cos(turn), np.sin(turn)])
-
-
-def _fastest(times: Array, path: Array) -> float:
-    return float((np.linalg.norm(np.diff(path, axis=0), axis=1) / np.diff(times)).max())
 
 
 def _drawn(imitation: AnyImitation, start: Array, extent: float, across: Array) -> float:

@@ -13,13 +13,14 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from PIL import Image
 
 from dt_viz.control.controller import Phase
 from dt_viz.errors import FormatError
-from dt_viz.evaluate.options import add_lasa
+from dt_viz.evaluate.options import output
 from dt_viz.folders import default_cache_folder
 from dt_viz.learning.store import FitStore
 from dt_viz.robot.models import load_jaco
@@ -30,13 +31,9 @@ from dt_viz.ui.server import Server
 from dt_viz.ui.visitor import Visitor
 from tests.chromium import ARGUMENTS, CHROMIUM
 
-OUT = "DIR"
-FIRST = "first"
-"""Name of the picture of the first page."""
-DRAWING = 8.0
-"""Time that software takes to draw the page, seconds."""
-PATIENCE = 180.0
-"""Longest time to wait for the page, seconds."""
+FIRST = "first"  # name of the picture of the first page
+DRAWING = 8.0  # time that software takes to draw the page, seconds
+PATIENCE = 180.0  # longest time to wait for the page, seconds
 HIDE_NOTICES = "() => document.querySelectorAll('button.mantine-Notification-closeButton').forEach(b => b.click())"
 
 
@@ -44,7 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the command's arguments."""
     names = (FIRST, *SCENES)
     parser.add_argument("--only", choices=names, nargs="+", metavar="NAME", help=", ".join(names))
-    add_lasa(parser)
+    parser.add_argument("--lasa", type=Path, metavar="DIR", help="folder of LASA .mat files, each becomes a task")
+    parser.add_argument("--out", type=output(), required=True, metavar="DIR", help="folder of what is written")
     parser.add_argument("--size", type=_size, default=(1920, 1080), metavar="W,H", help="pixels (default: 1920,1080)")
 
 
@@ -62,6 +60,7 @@ def run(options: argparse.Namespace) -> int:
     if lacking:
         raise FormatError("--only", ", ".join(lacking), "scenes whose tasks there are; --lasa DIR adds more")
     width, height = options.size
+    options.out.mkdir(parents=True, exist_ok=True)
     complaints: list[str] = []
     with sync_playwright() as playwright:
         server = Server(tasks, FitStore(default_cache_folder()), load_jaco(), task="draw_s", port=0)

@@ -12,40 +12,35 @@ import time
 
 import numpy as np
 
-from dt_viz.evaluate.options import TABLES, add_lasa, report
+from dt_viz.evaluate.options import report
 from dt_viz.folders import default_cache_folder
 from dt_viz.learning.store import FitStore
 from dt_viz.memo import Memo
 from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.paper_scenes import SCENES, offered
 from dt_viz.scenario.scenario import Scenario
-from dt_viz.scenario.tasks import known_tasks
+from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Stage
+from tests.benchmarks.options import add_out
 
-OUT = TABLES
-SHOWN = (Stage.ROLLOUTS, Stage.LIVE, Stage.CERTIFIED)
-"""Stages that are timed."""
+SHOWN = (Stage.ROLLOUTS, Stage.LIVE, Stage.CERTIFIED)  # stages that are timed
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the command's arguments."""
-    parser.add_argument("--only", choices=tuple(SCENES), nargs="+", metavar="NAME", help=", ".join(SCENES))
-    add_lasa(parser)
+    add_out(parser)
 
 
-def run(options: argparse.Namespace) -> int:
+def run(_options: argparse.Namespace) -> int:
     """Run the command."""
-    tasks = known_tasks(options.lasa)
     fits, shared, figures = FitStore(default_cache_folder()), Memo(), {}
-    for scene in offered(tasks):
-        if options.only and scene.name not in options.only:
-            continue
-        engine = Engine(tasks, fits, load_jaco(), shared)
+    for scene in offered(TASKS):
+        engine = Engine(TASKS, fits, load_jaco(), shared)
         task = engine.task(scene.task)
         _seconds(engine, Scenario(scene.task))  # as the page was before
         for other in scene.tasks:
-            fits.get(tasks[other]().demonstrations)
+            fits.get(TASKS[other]().demonstrations)
         figures[scene.name] = _seconds(engine, scene.scenario(task))
     certified = [times["certified_s"] for times in figures.values()]
     over_all = {"median": float(np.median(certified)), "worst": max(certified)}

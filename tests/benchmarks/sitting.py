@@ -1,4 +1,4 @@
-"""Most figures of the documents in one sitting, some with fewer runs: a table for each subject, as Markdown and JSON.
+"""Most figures of the documents in one sitting, some with fewer runs: a table for each subject, as JSON.
 
 Each command runs in a process of its own; what it prints as tables is put together, and what it writes is kept beside.
 """
@@ -20,8 +20,7 @@ from typing import Any
 from dt_viz.arguments import Parser
 from dt_viz.evaluate.__main__ import COMMANDS
 
-LASA = "LASA"
-"""Word in a command that stands for the files of `--lasa`."""
+LASA = "LASA"  # word in a command that stands for the files of `--lasa`
 
 
 @dataclass(frozen=True)
@@ -29,12 +28,9 @@ class Subject:
     """What one dated table is of."""
 
     title: str
-    commands: tuple[str, ...]
-    """Each of `dt_viz.evaluate` or `tests.benchmarks`, without `--out`."""
-    suffix: str
-    """Suffix of what the commands write; empty where it is a folder."""
-    num_rows: int = 0
-    """Number of the last rows of a command's tables that are wanted; 0 for all."""
+    commands: tuple[str, ...]  # each of `dt_viz.evaluate` or `tests.benchmarks`, without `--out`
+    suffix: str  # suffix of what the commands write; empty where it is a folder
+    num_rows: int = 0  # number of the last rows of a command's tables that are wanted; 0 for all
 
 
 def _for_tasks(command: str, tasks: Sequence[str] = ("push_box", "lift_box", "draw_s")) -> tuple[str, ...]:
@@ -64,11 +60,6 @@ SUBJECTS: Mapping[str, Subject] = {
     ),
     "fairness": Subject("Beside somebody who takes all that he can get", ("fairness --rounds 2",), ".json"),
     "scenes": Subject("Scenes of the paper", ("scenes",), ".json"),
-    "exactness": Subject(
-        "Exact rollouts",
-        ("exactness --task draw_s", *_for_tasks("exactness --task {} --parts starts", ("lift_box", "push_box"))),
-        ".json",
-    ),
     "reactive": Subject(
         "The robot in the loop",
         (
@@ -104,13 +95,6 @@ SUBJECTS: Mapping[str, Subject] = {
         ".npz",
         11,
     ),
-    "drag": Subject(
-        "Jumps while a sphere is dragged",
-        (*_for_tasks("drag --task {} --avoid hand --seed 43"), *_for_tasks("drag --task {} --drags 2 --seed 43")),
-        ".npz",
-        1,
-    ),
-    "arms": Subject("Other arms", ("arms --count 5 --seed 7",), ".npz"),
     "table1": Subject("The paper's comparison", ("table1 --perturbed 60 --jobs 2",), ""),
 }
 
@@ -153,10 +137,9 @@ def measured(name: str, subject: Subject, out: Path, files: Sequence[Path]) -> i
         return 0
     machine = {"cores": os.cpu_count(), "machine": platform.machine(), "python": platform.python_version()}
     table = {"title": subject.title, "date": date.today().isoformat(), **machine, "results": results}
-    path = out / name
-    path.with_suffix(".json").write_text(json.dumps(table, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
-    path.with_suffix(".md").write_text(markdown(table), encoding="utf-8")
-    print(f"{path}.md after {time.monotonic() - began:.0f} s", flush=True)
+    path = out / f"{name}.json"
+    path.write_text(json.dumps(table, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    print(f"{path} after {time.monotonic() - began:.0f} s", flush=True)
     return int(any(result["status"] for result in results))
 
 
@@ -184,20 +167,3 @@ def ran(words: Sequence[str], out: Path) -> dict[str, Any]:
         "seconds": time.monotonic() - began,
         "tables": json.loads(text)["tables"] if text else [],
     }
-
-
-def markdown(table: Mapping[str, Any]) -> str:
-    """The document of a table: one table of Markdown for successive rows of the same columns."""
-    from dt_viz.evaluate.options import as_text  # with numpy, which a benchmark imports once its threads are limited
-
-    lines = [f"# {table['title']}", "", f"{table['date']}, {table['cores']} cores, Python {table['python']}"]
-    for result in table["results"]:
-        failed = f": ended with status {result['status']}" if result["status"] else ""
-        lines += ["", f"    {result['command']}", "", f"{result['seconds']:.0f} s{failed}"]
-        header: tuple[str, ...] = ()
-        for row in result["rows"]:
-            if tuple(row) != header:
-                header = tuple(row)
-                lines += ["", "| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
-            lines.append("| " + " | ".join(as_text(cell) for cell in row.values()) + " |")
-    return "\n".join(lines) + "\n"

@@ -8,12 +8,8 @@ gives way and the place of the obstacle are compared with all that he had, back 
 
 back s
     from the loss to the first picture with something that he has had, of the page that has opened again.
-lost s
-    how old what he found again was when the connection was lost: time from where it was changed to then.
 edits lost
     number of times that not even the edit before the last one was found again whole.
-unknown
-    number of losses while nobody could know what he had, just after he had chosen something.
 
 Exit status 1: an edit was lost, a visitor did not come back, a connection was lost though no process was killed, or the
 log has an error.
@@ -37,43 +33,31 @@ from pathlib import Path
 import numpy as np
 import websockets
 
-from dt_viz.evaluate.load import started, used
-from dt_viz.evaluate.options import TABLES, positive_number, report, whole_number
-from dt_viz.evaluate.protocol_client import ANSWERED, OBSTACLE, LostError, ProtocolClient
-from dt_viz.evaluate.visit import spread
+from dt_viz.evaluate.options import positive_number, report, whole_number
 from dt_viz.flows.fields import Array
+from tests.benchmarks.load import started, used
+from tests.benchmarks.options import add_out
+from tests.benchmarks.visit import spread
+from tests.protocol_client import ANSWERED, OBSTACLE, LostError, ProtocolClient
 
-OUT = TABLES
-State = tuple[str, str, tuple[float, ...]]
-"""Task, what gives way, and place of the first obstacle, metres."""
+State = tuple[str, str, tuple[float, ...]]  # task, what gives way, and place of the first obstacle, metres
 
 
 @dataclass(frozen=True)
 class SoakSettings:
     """How visitors edit; times in seconds."""
 
-    moves: tuple[int, int] = (5, 40)
-    """Smallest and largest number of places of a drag."""
-    interval: float = 0.05
-    """Time from one place to the next."""
-    step: float = 0.004
-    """Standard deviation of the way from one place to the next along each axis, metres."""
-    rest: tuple[float, float] = (0.2, 1.5)
-    """Shortest and longest time from one edit to the next."""
-    choices: float = 0.15
-    """Part of the edits that choose something."""
-    settled: float = 5.0
-    """Time after which the page has what was chosen."""
-    recent: float = 5.0
-    """Time after a kill in which a lost connection is its consequence."""
-    told: float = 10.0
-    """Time in which a browser that is slow tells what it keeps, while its page shows how it begins."""
-    patience: float = 60.0
-    """Longest time to wait for a page."""
-    first_kill: float = 10.0
-    """Time until all are there."""
-    sample: float = 2.0
-    """Time from one look at the memory to the next."""
+    moves: tuple[int, int] = (5, 40)  # smallest and largest number of places of a drag
+    interval: float = 0.05  # time from one place to the next
+    step: float = 0.004  # standard deviation of the way from one place to the next along each axis, metres
+    rest: tuple[float, float] = (0.2, 1.5)  # shortest and longest time from one edit to the next
+    choices: float = 0.15  # part of the edits that choose something
+    settled: float = 5.0  # time after which the page has what was chosen
+    recent: float = 5.0  # time after a kill in which a lost connection is its consequence
+    told: float = 10.0  # time in which a slow browser answers what it keeps, while its page shows how it begins
+    patience: float = 60.0  # longest time to wait for a page
+    first_kill: float = 10.0  # time until all are there
+    sample: float = 2.0  # time from one look at the memory to the next
 
 
 SETTINGS = SoakSettings()
@@ -85,21 +69,13 @@ class Soaked:
 
     url: str
     seed: int
-    killed: Callable[[], float]
-    """Returns when a process was killed last, seconds of `time.monotonic`."""
+    killed: Callable[[], float]  # returns when a process was killed last, seconds of `time.monotonic`
     had: list[tuple[float, int, State | None]] = field(default_factory=list)
     """Times, numbers of the edits, and states; None while it is unknown."""
-    back: list[float] = field(default_factory=list)
-    """Times from a loss to the page that has opened again, seconds."""
-    ages: list[float] = field(default_factory=list)
-    """How old what was found again was, seconds."""
+    back: list[float] = field(default_factory=list)  # times from a loss to the page that has opened again, seconds
     num_edits: int = 0
-    num_lost: int = 0
-    """Number of edits before the last that were not found again."""
-    num_unknown: int = 0
-    """Number of losses after which nothing could be compared."""
-    reasons: list[str] = field(default_factory=list)
-    """What ended connections beside kills, and pages that did not open."""
+    num_lost: int = 0  # number of edits before the last that were not found again
+    reasons: list[str] = field(default_factory=list)  # what ended connections beside kills, and pages that did not open
 
     async def run(self, deadline: float) -> None:
         """Edit until a time of `time.monotonic`."""
@@ -108,8 +84,7 @@ class Soaked:
             try:
                 async with ProtocolClient(self.url) as client:
                     client.storage = storage
-                    await client.look()
-                    if not await client.wait_for(lambda client=client: client.has_picture, SETTINGS.patience):
+                    if not await client.look_until_drawn(SETTINGS.patience):
                         self.reasons.append("no picture in time")
                         return
                     if lost:
@@ -166,11 +141,9 @@ class Soaked:
         had = [entry for entry in self.had if entry[0] <= lost] or self.had[:1]
         last = had[-1][1] if had else 0
         for k, (_, edit, state) in reversed([*enumerate(had)]):
-            if state is None:
-                self.num_unknown += 1
+            if state is None:  # just after he had chosen something: nothing can be compared
                 return
             if is_same(state, found):
-                self.ages.append(0.0 if k == len(had) - 1 else lost - had[k + 1][0])
                 whole = k == len(had) - 1 or had[k + 1][1] > edit
                 if not (edit >= last or (edit == last - 1 and whole)):
                     self._loses(found, had, lost)
@@ -203,8 +176,8 @@ def is_same(one: State, other: State) -> bool:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the command's arguments."""
+    add_out(parser)
     parser.add_argument("--visitors", type=whole_number(1), default=4, help="at once (default: 4)")
-    parser.add_argument("--processes", type=whole_number(2), default=2, help="of the server (default: 2)")
     parser.add_argument("--kills", type=whole_number(0), default=40, help="of a process each (default: 40)")
     parser.add_argument("--seconds", type=positive_number("seconds", 24 * 3600), default=600.0, help="(default: 600)")
     parser.add_argument("--seed", type=whole_number(0), default=0, help="of edits and kills (default: 0)")
@@ -212,9 +185,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run the command; see the module for its exit status."""
-    arguments = ["--max-sessions", str(options.visitors), "--processes", str(options.processes)]
+    arguments = ["--max-sessions", str(options.visitors), "--processes", "2"]
     with tempfile.TemporaryFile("w+", encoding="utf-8") as log:
-        with started([*arguments, "--max-of-address", str(2 * options.visitors)], log) as (url, process):
+        with started([*arguments, "--max-of-address", str(2 * options.visitors)], log) as (url, process, _):
             visitors, memory = asyncio.run(_soaked(options, url, process))
         log.seek(0)
         lines = log.read().splitlines()
@@ -230,9 +203,7 @@ def run(options: argparse.Namespace) -> int:
         "kills": options.kills,
         "losses": sum(len(visitor.back) for visitor in visitors),
         "back s": _spread([back for visitor in visitors for back in visitor.back]),
-        "lost s": _spread([age for visitor in visitors for age in visitor.ages]),
         "edits lost": num_lost,
-        "unknown": sum(visitor.num_unknown for visitor in visitors),
         "lost otherwise": len(reasons),
         "errors in the log": len(errors),
         "MB, third and last quarter": f"{np.mean(third):.0f}, {np.mean(fourth):.0f}" if len(memory) > 3 else None,

@@ -28,8 +28,6 @@ from pages import camera_for
 from PIL import Image
 from scenes import changing
 
-from dt_viz.control.controller import Phase
-from dt_viz.files import uploads
 from dt_viz.metrics import maximum_collision_distance
 from dt_viz.obstacles.shapes import MeshObstacle
 from dt_viz.scenario.tasks import TASKS
@@ -37,48 +35,22 @@ from dt_viz.ui.scene.slice_layers import VOLUME
 from dt_viz.ui.visitor import Visitor
 
 WIDTH, HEIGHT = 720, 450
-CORNER = (5, 5)
-"""CSS pixels where the mouse touches nothing."""
+CORNER = (5, 5)  # CSS pixels where the mouse touches nothing
 pytestmark = [pytest.mark.browser, needs_chromium]
-
-
-class Tab:
-    """One tab for all tests: opening it takes longer than most of them."""
-
-    def __init__(self, browser, server):
-        self._browser, self._server, self._opened = browser, server, None
-        self.sound = True
-        """Whether it can be visited again: not after a test that failed, until that is known of the next one."""
-
-    def visit(self):
-        if not self.sound:
-            self.close()
-        if self._opened is None:
-            self._opened = open_page(self._browser, self._server, (WIDTH, HEIGHT))
-        self.sound = False
-        return self._opened
-
-    def close(self):
-        if self._opened is not None:
-            page, visitor = self._opened
-            self._opened = None
-            close_page(page, self._server, visitor)
 
 
 @pytest.fixture(scope="module")
 def tab(browser, server):
-    tab = Tab(browser, server)
-    tab.visit()
-    tab.sound = True
-    yield tab
-    tab.close()
+    """One tab for all tests: opening it takes longer than most of them."""
+    page, visitor = open_page(browser, server, (WIDTH, HEIGHT))
+    yield page, visitor
+    close_page(page, server, visitor)
 
 
 @pytest.fixture
-def visit(tab, initial, request):
+def visit(tab, initial):
     """The tab as it is when a visitor comes, but for the arm: the hand avoids, and nothing else is drawn or moves."""
-    failed = request.session.testsfailed
-    page, visitor = tab.visit()
+    page, visitor = tab
     begin(visitor, replace(initial("draw_s"), view=LIGHT))
     page.mouse.move(*CORNER)
     open_tab(page, "World")
@@ -86,8 +58,7 @@ def visit(tab, initial, request):
     until_drawn(visitor)
     close_notices(page)
     wait_until(lambda: camera_rests(visitor), "the camera to stand where the task wants it")
-    yield page, visitor
-    tab.sound = request.session.testsfailed == failed
+    return page, visitor
 
 
 def look_home(visitor: Visitor) -> None:
@@ -195,8 +166,7 @@ def upload_in(page):
     return page.locator("input[type=file]").first
 
 
-def test_a_mesh_is_uploaded_in_its_own_unit_and_turned_by_its_handle(visit, monkeypatch):
-    monkeypatch.setattr(uploads, "_ready", uploads._Ready())  # the tab stays open, and no process with it
+def test_a_mesh_is_uploaded_in_its_own_unit_and_turned_by_its_handle(visit):
     page, visitor = visit
     session = visitor.session
     session.edit("test", **changing(session.scenario, obstacles=(), avoids=False))
@@ -257,48 +227,3 @@ def test_the_saved_png_has_the_chosen_size_and_is_not_blank(visit):
     corner = np.asarray(image)[-120:, :450].reshape(-1, 3).astype(int)
     for shade in VOLUME[[0, -1]].astype(int):  # the legend's ends
         assert (np.abs(corner - shade).max(axis=1) < 4).any()
-
-
-def test_keys_do_what_the_panel_does(visit):
-    page, visitor = visit
-    session = visitor.session
-    page.evaluate("document.activeElement.blur()")
-    page.keyboard.press("Space")
-    wait_until(lambda: session.scenario.view.playing, "the arm to move")
-    page.keyboard.press("Space")
-    wait_until(lambda: not session.scenario.view.playing, "the arm to rest")
-    session.edit("warp", warp=0.5)
-    for key, warp in (("z", 1), ("Shift+Z", 0.5), ("z", 1)):
-        page.keyboard.press(key)
-        wait_until(lambda warp=warp: session.scenario.warp == warp, f"the key {key}")
-    shown = page.get_by_role("button", name="Undo", exact=True)
-    page.keyboard.press("h")
-    shown.wait_for(state="hidden")
-    page.keyboard.press("h")
-    shown.wait_for()
-
-
-@pytest.mark.slow
-def test_the_hand_is_dragged_in_a_pause_and_goes_on_to_the_goal_when_it_is_let_go(visit):
-    page, visitor = visit
-    session = visitor.session
-    session.edit("test", **changing(session.scenario, obstacles=()), view=replace(LIGHT, arm=True))
-    wait_until(lambda: session.wait_idle(0.3) and visitor.shown.scenario == session.scenario, "a motion")
-    assert visitor.robot.grip.visible
-    before = visitor.robot.hand
-
-    def from_the_ball():
-        x, y = project(page, visitor, before)
-        return (x, y), (x - 50, y - 40)
-
-    drag_until(page, visitor, lambda: np.linalg.norm(visitor.robot.hand - before) > 0.02, lambda: None, from_the_ball)
-    live = visitor.robot.playback.live
-    wait_until(lambda: live.phase is not Phase.HELD, "the hand to be where it was let go")
-    hand = visitor.robot.hand
-    assert np.linalg.norm(hand - before) > 0.05
-    assert abs(hand[1] - before[1]) < 5e-3  # parallel to the drawing plane, y = const
-    np.testing.assert_allclose(project(page, visitor, hand), from_the_ball()[1], atol=12)
-    assert np.linalg.norm(live.ahead[0] - hand) < 0.02  # from here on
-    session.edit("play", view=replace(LIGHT, arm=True, playing=True, speed=3.0))
-    wait_until(lambda: np.linalg.norm(visitor.robot.hand - visitor.shown.goal) < 5e-3, "the goal")
-    wait_until(lambda: live.phase is Phase.HOMING, "the next round")

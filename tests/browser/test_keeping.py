@@ -1,12 +1,7 @@
 """What a visitor has made is in his browser: after a reload, and in another process that serves the same address."""
 
-import os
 import re
-import signal
-import subprocess
-import sys
-from contextlib import contextmanager
-from pathlib import Path
+from dataclasses import replace
 
 import browsing
 import numpy as np
@@ -18,19 +13,21 @@ from browsing import (
     open_tab,
     page_errors,
     press,
+    travel,
     until_drawn,
     wait_until,
 )
 from chromium import needs_chromium
+from demo import address, started
 
-import dt_viz
 from dt_viz.scenario.saved import Known, decode
+from dt_viz.scenario.slices import BASE_PANEL
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui import keeping
+from dt_viz.ui.panel import HISTORY
+from dt_viz.ui.visitor import initial
 
 pytestmark = [pytest.mark.browser, needs_chromium]
-
-APP = Path(dt_viz.__file__).parent.parent / "app.py"
 
 
 def kept(page):
@@ -96,9 +93,58 @@ def test_after_a_reload_the_visitor_finds_what_he_has_made(visit, server):
     wait_until(lambda: len(again.session.scenario.obstacles) == 1, "it to be gone")
     page.get_by_text(re.compile("· as saved$")).wait_for(state="detached")
     press(page.get_by_role("button", name="Reset", exact=True))
-    wait_until(lambda: kept(page) is None, "the browser to forget it")
-    anew = reload(page, server)
-    assert anew.session.scenario.view.arm and page.get_by_text(re.compile("· as saved$")).count() == 0
+    fresh = initial(again.session.engine.task("draw_s"))
+    wait_until(lambda: kept(page) == fresh, "the browser to keep how it began")
+    assert reload(page, server).session.scenario == fresh
+
+
+def test_undo_brings_back_what_reset_took_also_the_view_and_the_camera(visit, server):
+    page, visitor = visit
+    session = visitor.session
+    session.step("test", warp=0.5)
+    session.edit("test", view=replace(session.scenario.view, grid=True, panels=(BASE_PANEL,)))
+    assert session.wait_idle(PATIENCE)
+    until_drawn(visitor)
+    camera, before = visitor._camera, session.scenario
+    camera.view("Top")
+    until_drawn(visitor)
+    pose = camera.chosen
+    assert pose is not None
+
+    def settled(is_there, what):
+        wait_until(is_there, what)
+        assert session.wait_idle(PATIENCE)
+        until_drawn(visitor)
+
+    def has_begun():
+        return session.scenario.warp == 1 and camera.chosen is None
+
+    def is_as_before():
+        return session.scenario == before and camera.chosen is not None and np.allclose(camera.chosen, pose, atol=2e-3)
+
+    press(page.get_by_role("button", name="Reset", exact=True))
+    settled(has_begun, "the scene and the camera as they began")
+    assert not session.scenario.view.grid
+    travel(page, "Undo")
+    settled(is_as_before, "the scenario, its view and the camera again")
+    travel(page, "Redo")
+    settled(has_begun, "them as they began again")
+    travel(page, "Undo")
+    settled(is_as_before, "what was there")
+    travel(page, "Undo")
+    wait_until(lambda: session.scenario.warp == 1 and session.scenario.view.grid, "the step before, seen as now")
+
+
+def test_the_buttons_of_the_history_are_one_row_and_each_has_a_hint_of_its_own(visit):
+    page, _ = visit
+    buttons = [page.get_by_role("button", name=name, exact=True) for name in HISTORY]
+    wait_until(lambda: all(button.bounding_box() for button in buttons), "the buttons")
+    assert len({button.bounding_box()["y"] for button in buttons}) == 1
+    for button, hint in zip(buttons, HISTORY.values(), strict=True):
+        page.mouse.move(5, 5)
+        page.get_by_role("tooltip").wait_for(state="detached")
+        button.hover(force=True)
+        wait_until(lambda hint=hint: page.get_by_role("tooltip").all_inner_texts() == [hint], "the hint")
 
 
 def test_a_browser_that_is_not_allowed_to_keep_anything_says_so_and_the_page_goes_on(visit, server):
@@ -137,36 +183,20 @@ def test_a_browser_without_room_says_so_and_the_page_goes_on(visit, server):
     page_errors.clear()  # of what had no room
 
 
-# --- another process ---
-
-
-@contextmanager
-def serving(cache, port):
-    """A server in a process of its own; its address and it."""
-    command = [sys.executable, str(APP), "--port", str(port), "--processes", "1"]
-    environment = os.environ | {"XDG_CACHE_HOME": str(cache), "PYTHONUNBUFFERED": "1"}
-    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            said = iter(process.stdout or ())
-            address = next(found[1] for line in said if (found := re.search(r"DT-Viz is at (http://\S+)", line)))
-            yield address, process
-        finally:
-            process.kill()
-
-
 def test_a_killed_server_loses_nothing(browser, cache, fits):
     page = browser.new_page(viewport={"width": 720, "height": 450})
     page.set_default_timeout(1000 * PATIENCE)
     page.add_init_script(UNHURRIED)
-    with serving(cache, 0) as (address, process):
-        page.goto(address)
+    with started(cache, patience=4 * PATIENCE) as process:
+        port = address(process).rpartition(":")[2]
+        page.goto(f"http://127.0.0.1:{port}")
         page.get_by_role("button", name="Delete", exact=True).wait_for()
         add(page, "Delete")  # there is less to compute than with an obstacle
         wait_until(lambda: (found := kept(page)) is not None and not found.obstacles, "the browser to keep it")
         made = kept(page)
-        process.send_signal(signal.SIGKILL)
+        process.kill()
         process.wait()
-    with serving(cache, int(address.rpartition(":")[2])):
+    with started(cache, "--port", port, patience=4 * PATIENCE):
         page.get_by_text(re.compile("· as saved$")).wait_for()  # the page connects again by itself
         assert kept(page) == made
         page.close()

@@ -25,9 +25,3 @@ def test_a_scene_is_seen_with_its_panels_and_nothing_is_complained_of(tmp_path, 
     for k in range(3):
         part = slice(k * third, (k + 1) * third)
         assert orange[:, part].sum() > 100 and green[:, part].sum() > 20
-
-
-def test_a_scene_that_there_is_not_is_refused(tmp_path, capsys):
-    with pytest.raises(SystemExit):
-        main(["pictures", "--only", "nothing", "--out", str(tmp_path)])
-    assert "invalid choice: 'nothing'" in capsys.readouterr().err

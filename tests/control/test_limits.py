@@ -8,10 +8,10 @@ from body_spheres import cover
 
 from dt_viz.avoidance.arm import WholeArm
 from dt_viz.avoidance.avoidance import ArmAvoidance
-from dt_viz.control.limits import ObstacleLimit
-from dt_viz.control.obstacle_motion import ObstacleMotion, Sighting
+from dt_viz.control.feasible import ObstacleLimit
+from dt_viz.control.obstacle_flow import ObstacleMotion, Sighting
 from dt_viz.kernels.dodging import LimitedArm
-from dt_viz.kernels.limits import IMMOBILE, NUM_ROWS, STEADIEST, barrier, velocity_bounds
+from dt_viz.kernels.limits import velocity_bounds
 from dt_viz.obstacles.shapes import Box, Cylinder, Sphere, as_point
 from dt_viz.obstacles.union import Union
 
@@ -98,15 +98,3 @@ def test_who_obeys_brakes_before_the_range_ends_and_keeps_speed_and_acceleration
             nearest = min(nearest, (q - robot.lower).min(), (robot.upper - q).min())
         assert (np.abs(velocity) <= robot.velocity_limits * (1 + 1e-9)).all()
     assert 0 <= nearest < 0.01
-
-
-@pytest.mark.parametrize("num", [0, 1, NUM_ROWS, 40])
-def test_barriers_are_those_of_the_smallest_distances_that_joints_change(num):
-    rng = np.random.default_rng(num)
-    h, slopes = rng.normal(size=num), rng.normal(size=(num, 6)) * (rng.random((num, 1)) < 0.8)
-    moved = np.flatnonzero((slopes**2).sum(axis=1) > IMMOBILE)
-    near, bounds = barrier(h, slopes, GAIN, TICK)
-    np.testing.assert_array_equal(near, moved[np.argsort(h[moved])][:NUM_ROWS])
-    np.testing.assert_allclose(bounds, -GAIN * np.where(h[near] > 0, h[near], 2 * h[near]))
-    _, slower = barrier(h, slopes, 1e3, TICK)
-    np.testing.assert_allclose(slower * TICK, -STEADIEST * np.where(h[near] > 0, h[near], 2 * h[near]))

@@ -7,8 +7,6 @@ import pytest
 from hook import write_mat
 
 from dt_viz.evaluate.__main__ import main as evaluate
-from tests.benchmarks.__main__ import NAMES
-from tests.benchmarks.__main__ import main as benchmarks
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -27,13 +25,12 @@ def lasa(tmp_path_factory):
 
 @pytest.fixture
 def measured(lasa, tmp_path, capsys):
-    """Runs a command or a benchmark on the hook: what it writes (npz) and the tables that it prints."""
+    """Runs a command on the hook: what it writes (npz) and the tables that it prints."""
 
     def run(command, options, form="npz"):
         out, tables = tmp_path / f"{command}.{form}", tmp_path / "tables.json"
-        main = benchmarks if command in NAMES else evaluate
         arguments = ["--task", "Hook", "--lasa", str(lasa), *options.split(), "--out", str(out)]
-        assert main([command, *arguments, "--tables", str(tables)]) == 0
+        assert evaluate([command, *arguments, "--tables", str(tables)]) == 0
         printed = json.loads(tables.read_text())["tables"]
         capsys.readouterr()
         if form == "json":

@@ -1,19 +1,16 @@
 """Obstacles in the way of motions: what is measured around them, and where they are."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 from hook import NUM_DEMONSTRATIONS, apart, hook
 
-from dt_viz.avoidance.avoidance import Avoidance, Space
+from dt_viz.avoidance.avoidance import Avoidance
 from dt_viz.evaluate.__main__ import main
-from dt_viz.evaluate.around import FIGURES, TURN_ARC, Place, _shares
+from dt_viz.evaluate.around import FIGURES, TURN_ARC, _row, _shares
 from dt_viz.metrics import distance_from_path, sharpest_turn
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.tasks import known_tasks
-from dt_viz.warning import ARM, Kind, MotionWarning
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +122,7 @@ def test_places_are_any_shapes_of_any_size_along_the_whole_motion(lasa, measured
     places, sizes = arrays["places"][1:], arrays["sizes"][1:]
     assert (places[:, 0] != places[:, 1]).any(axis=1).all()
     assert places.shape == sizes.shape == (12, 2, 3) and arrays["turns"].shape == (13, 2, 4)
-    assert set(arrays["shapes"][1:].ravel()) == {"sphere", "box", "cylinder"}
+    assert set(arrays["shapes"][1:].ravel()) == {"sphere", "box", "cylinder", "capsule"}
     assert 0.06 <= sizes.min() < 0.1 and 0.2 < sizes.max() <= 0.25
     nearest = np.linalg.norm(places[:, :, None] - mean, axis=3).argmin(axis=2)
     assert nearest.min() < 25 and nearest.max() > 75
@@ -133,37 +130,47 @@ def test_places_are_any_shapes_of_any_size_along_the_whole_motion(lasa, measured
 
 
 USUAL = {"hand": 0.03, "arm": 0.012, "hand_without": -0.04, "arm_without": -0.06, "frechet": 0.08, "detour": 0.07}
-SPHERE = Sphere((0.0, 0.0, 0.0), 0.1)
+USUAL |= {"turn": 20, "turn_without": 10}
+OF_ARM, OF_HAND = (Avoidance((), space=space) for space in ("cspace", "task"))
 
 
-def place(*rollouts, space: Space = "cspace", ends=(0.1, 0.1, 0.2), blocked=()):
-    """A place: what is unusual about each rollout, None of a start without one."""
-    figures = np.full((len(ends) - 1, len(FIGURES)), np.nan)
-    motions: Any = {i: None for i, changes in enumerate(rollouts) if changes is not None}
-    for i in motions:
-        for figure, value in ({"turn": 20, "turn_without": 10} | USUAL | rollouts[i]).items():
-            figures[i, FIGURES.index(figure)] = value
-    return Place(Avoidance((SPHERE,), space=space), np.array(ends), motions, figures, blocked)
+def measurements(*rollouts):
+    """Figures (R, F) of a place: what is unusual about each rollout, None of a start without one."""
+    figures = np.full((len(rollouts), len(FIGURES)), np.nan)
+    for i, changes in enumerate(rollouts):
+        if changes is not None:
+            figures[i] = [(USUAL | changes).get(figure, np.nan) for figure in FIGURES]
+    return figures
 
 
-@pytest.mark.parametrize(("space", "clearance", "forced"), [("task", 0.01, 0.06), ("cspace", -0.002, 0.08)])
-def test_a_place_is_judged_by_its_worst_rollout_and_by_what_avoids(space, clearance, forced):
+@pytest.mark.parametrize(("avoidance", "without", "forced"), [(OF_HAND, -50, 0.06), (OF_ARM, -70, 0.08)])
+def test_a_row_has_the_worst_rollout_and_the_detour_relative_to_what_is_forced(avoidance, without, forced):
     worst = {"hand": 0.01, "arm": -0.002, "hand_without": -0.05, "arm_without": -0.07, "detour": 0.12}
-    found = place({}, None, worst, space=space, ends=(0.1, -0.1, 0.2, 0.2))
-    assert found.clearance == clearance and found.ratio == pytest.approx(0.12 / forced)
+    row = _row("place 0", measurements({}, None, worst), avoidance)
+    assert row["hand mm"] == pytest.approx(10) and row["arm mm"] == pytest.approx(-2)
+    assert row["without mm"] == pytest.approx(without) and row["detour/forced"] == pytest.approx(0.12 / forced)
+
+
+def shares(*places, avoidance=OF_ARM):
+    """Shares of places: ends, and figures of the rollouts."""
+    ends, figures = (np.array(each) for each in zip(*places, strict=True))
+    blocked = np.isnan(figures[..., 0]).all(axis=1)
+    arrays = {"ends": ends, "blocked": blocked, "no_way": blocked, "frechet": figures[..., FIGURES.index("frechet")]}
+    return dict(_shares(arrays, figures, avoidance))
 
 
 def test_only_starts_with_a_rollout_and_the_goal_have_to_be_free():
-    assert place({}, None, ends=(0.1, -0.1, 0.2)).is_free
-    assert not place({}, {}, ends=(0.1, -0.1, 0.2)).is_free
-    assert not place({}, None, ends=(0.1, -0.1, -0.2)).is_free
+    places = [((0.1, -0.1, 0.2), measurements({}, changes)) for changes in (None, {})]
+    places.append(((0.1, 0.1, -0.2), measurements({}, {})))
+    assert shares(*places)["collisions"] == "0 of 1 (0.0 %)"
 
 
 def test_shares_are_of_the_places_that_have_motions():
-    places = [place({"arm": clearance}, {}) for clearance in (0.012, 0.0095, 0.005, -0.002)]
-    places.append(place(None, {"turn": 91}))
-    places.append(place(ends=(-0.1, -0.1, -0.2), blocked=(MotionWarning(Kind.NO_WAY, "", ARM),)))
-    figures = {row["figure"]: str(row["value"]) for row in _shares(places)}
+    free = (0.1, 0.1, 0.2)
+    places = [(free, measurements({"arm": clearance}, {})) for clearance in (0.012, 0.0095, 0.005, -0.002)]
+    places.append((free, measurements(None, {"turn": 91})))
+    places.append(((-0.1, -0.1, -0.2), measurements(None, None)))
+    figures = shares(*places)
     assert figures["places that leave the end effector's starts and goal free"].startswith("5 of 6")
     assert figures["blocked"].startswith("1 of 6") and figures["blocked between free ends"].startswith("1 of 6")
     assert figures["from some of the starts only"].startswith("1 of 5")

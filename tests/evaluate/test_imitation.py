@@ -1,7 +1,6 @@
 """What was learned of files, beside what was demonstrated, in-sample and held out."""
 
 import json
-import re
 import sys
 from dataclasses import replace
 
@@ -14,7 +13,7 @@ from turning import turning_takes
 
 from dt_viz.evaluate import imitation
 from dt_viz.evaluate.__main__ import main
-from dt_viz.evaluate.held_out import WAYS, degrees_off, follow
+from dt_viz.evaluate.held_out import WAYS, degrees_off, folds_of, follow
 from dt_viz.flows.rotations import quaternions, rotation
 from dt_viz.learning.augmented import fit_augmented
 from dt_viz.learning.demonstrations import Demonstration, save_demonstrations
@@ -112,23 +111,6 @@ def test_imitation_writes_each_rollout_in_the_unit_of_the_file_from_start_to_goa
     assert (green - red > 50).sum() > 500 and (red - green > 100).sum() > 500  # demonstrations and rollouts
 
 
-@pytest.mark.long
-def test_the_worst_of_what_was_held_out_is_drawn(left_out, monkeypatch, lasa, tmp_path):
-    assert (left_out / "worst.png").read_bytes().startswith(b"\x89PNG")
-    drawn = []
-    monkeypatch.setattr(figures, "save", lambda figure, *paths: drawn.append((figure, paths[0].name)))
-    assert main(["imitation", str(lasa / "Hook.mat"), "--leave-one-out", "--out", str(tmp_path)]) == 0
-    worst = next(figure for figure, name in drawn if name == "worst.png")
-    distances = [float(axes.get_title().split("  ")[1].split(" mm")[0]) for axes in worst.axes]
-    (summed,) = json.loads((left_out / "figures.json").read_text())["held_out"]
-    assert np.mean(distances) == pytest.approx(summed["learned_mm"], abs=0.06)
-    assert distances == sorted(distances, reverse=True)  # of one shape, in which all have one extent
-    *_, learned, goal = worst.axes[0].lines
-    assert learned.get_color() == figures.STYLES["learned"]["color"]
-    ends = np.array(learned.get_xydata())[-1], np.array(goal.get_xydata())[0]
-    np.testing.assert_allclose(*ends, atol=1e-3)
-
-
 def test_a_panel_is_drawn_from_the_broadest_side_under_its_name():
     path = np.column_stack([np.linspace(0, 3, 20), np.linspace(0, 4, 20), np.linspace(0, 1, 20)])
     figure = figures.panels(
@@ -169,9 +151,9 @@ def test_what_is_held_out_is_not_learned_from():
         learned_from.append([d.name for d in others])
         return fit(others)
 
-    followed = follow(demonstrations, learn, folds=2)
+    followed = [f for held in folds_of(4, 2) for f in follow(demonstrations, learn, held)]
     assert learned_from == [["1", "3"], ["0", "2"]]
-    assert [f.demonstration.name for f in followed] == ["0", "1", "2", "3"]
+    assert [(f.number, f.demonstration.name) for f in followed] == [(0, "0"), (2, "2"), (1, "1"), (3, "3")]
     nearest = resample_by_arc_length(demonstrations[1].positions, 400)  # the nearest start of 1 and 3
     np.testing.assert_allclose(
         followed[0].motions["nearest"][0] - nearest,
@@ -196,23 +178,6 @@ def test_a_shape_that_cannot_be_fitted_does_not_keep_the_others_from_it(lasa, tm
     assert main(["imitation", str(space), str(lasa / "Hook.mat"), "--out", str(tmp_path / "out")]) == 2
     assert f"{space}: demonstration 'lifted' is too strange" in capsys.readouterr().err
     assert (tmp_path / "out" / "Hook.npz").exists() and not (tmp_path / "out" / "space.npz").exists()
-
-
-@pytest.mark.long
-def test_what_was_chosen_and_the_trivial_way_are_printed(lasa, tmp_path, capsys):
-    recorded = [hook(i) for i in range(4)]
-    save_demonstrations(
-        tmp_path / "hooks.npz", [Demonstration(t, path / 1000, str(i)) for i, (t, path) in enumerate(recorded)]
-    )
-    run = ["imitation", str(tmp_path / "hooks.npz"), "--state", "auto", "--folds", "2", "--out", str(tmp_path / "out")]
-    assert main(run) == 0
-    printed = capsys.readouterr().out
-    (row,) = json.loads((tmp_path / "out" / "figures.json").read_text())["held_out"]
-    assert row["of_mean"] == pytest.approx(row["learned_mm"] / row["mean_mm"]) and row["plain"] in (0, 0.5, 1)
-    assert re.search(
-        r"hooks: (plain|augmented)\. \d demonstrations left out: plain .* mm .* × the shifted mean", printed
-    )
-    assert f"{row['of_mean']:.3f} at worst" in printed
 
 
 @pytest.mark.long

@@ -48,10 +48,10 @@ def bench(engine):
 @pytest.mark.parametrize(("speed", "num"), [(0.1, 1), (1.0, 1), (0.5, 2)])
 def test_spheres_cross_the_motion_when_the_hand_is_there(bench, speed, num):
     found = list(islice(reactive.crossings(bench, speed, seed=1, num=num), 3))
-    assert [crossing.start for crossing, _ in found] == [0, 1, 2]
-    for crossing, seconds in found:
+    assert [crossing.start for crossing in found] == [0, 1, 2]
+    for crossing in found:
         hand, joints = bench.undisturbed(crossing.start)
-        assert seconds == pytest.approx(len(hand) * reactive.TICK) and crossing.places.shape[1] == num
+        assert crossing.seconds == pytest.approx(len(hand) * reactive.TICK) and crossing.places.shape[1] == num
         assert np.linalg.norm(hand[-1] - bench.goal) < 1e-3
         comes = np.isfinite(crossing.places[..., 0]).argmax(axis=0)
         assert crossing.begins == 0 or comes.min() == 0  # no time is lost
@@ -65,22 +65,22 @@ def test_spheres_cross_the_motion_when_the_hand_is_there(bench, speed, num):
             assert np.linalg.norm(path[len(path) // 2] - hand[tick]) < 0.08
             there = joints[max(0, int(first - crossing.begins / reactive.TICK))]
             gap = bench.follower.whole_arm.clearance(there[None], bench.shape(path[0]))[0]
-            assert gap >= reactive.SETTINGS.start_room - 0.02
-            assert path[:, 2].min() >= 0.075 + reactive.SETTINGS.table_room
+            assert gap >= reactive.START_ROOM - 0.02
+            assert path[:, 2].min() >= 0.075 + reactive.TABLE_ROOM
         assert np.isnan(crossing.at(len(crossing.places))).all()
 
 
 def test_a_second_obstacle_and_a_turned_box_count(engine):
     boxes = reactive.Bench(engine, "draw_s", 0.15, 0.03, boxes=True)
-    crossing, _ = next(reactive.crossings(boxes, 0.5, seed=2, num=2))
+    crossing = next(reactive.crossings(boxes, 0.5, seed=2, num=2))
     t = int(np.isfinite(crossing.places[..., 0]).argmax(axis=0).max())
     parts = boxes.obstacles(crossing, t)
     assert len(parts) == 2 and parts[0].wxyz == crossing.wxyz[0] != parts[1].wxyz
     np.testing.assert_allclose([part.position for part in parts], crossing.at(t))
     q, model = boxes.starts[:1], load_jaco().collision
-    alone = reactive.Crossing(0, 0.0, crossing.at(t)[None], crossing.wxyz)
+    alone = reactive.Crossing(0, 0.0, 0.0, crossing.at(t)[None], crossing.wxyz)
     expected = min(float(model.obstacle_distance(q, part)[0][0]) for part in parts)
-    assert reactive.smallest_distance(boxes, reactive.Run([q[0]]), alone) == pytest.approx(expected, abs=1e-9)
+    assert reactive.smallest_distance(boxes, q, alone) == pytest.approx(expected, abs=1e-9)
 
 
 def test_the_smallest_distance_is_found_between_ticks_too(bench):
@@ -91,8 +91,8 @@ def test_the_smallest_distance_is_found_between_ticks_too(bench):
     fine = np.linspace(0, 1, 7)[:, None]
     dense = np.concatenate([(1 - fine) * a + fine * b for a, b in ((places[0], places[1]), (places[1], places[2]))])
     least = nearest(np.repeat(q[:1], len(dense), axis=0), dense, bench.diameter)
-    crossing = reactive.Crossing(0, 0.0, places[:, None], [UPRIGHT])
-    found = reactive.smallest_distance(bench, reactive.Run(list(q)), crossing)
+    crossing = reactive.Crossing(0, 0.0, 0.0, places[:, None], [UPRIGHT])
+    found = reactive.smallest_distance(bench, q, crossing)
     assert found == pytest.approx(least, abs=1e-9)
     assert found < nearest(q[:3], places[:3], bench.diameter) - 0.01
 
@@ -103,8 +103,8 @@ def test_the_room_of_an_obstacle_that_comes_is_that_of_the_arm_as_it_is_then(ben
     gone, far = np.full(3, np.nan), np.array([3.0, 0.0, 0.0])
 
     def room(*centres):
-        crossing = reactive.Crossing(0, 0.0, np.array(centres), 2 * [UPRIGHT])
-        return reactive.room_at_coming(bench, reactive.Run(list(q)), crossing)
+        crossing = reactive.Crossing(0, 0.0, 0.0, np.array(centres), 2 * [UPRIGHT])
+        return reactive.room_at_coming(bench, q, crossing)
 
     assert room([far, gone], [hands[0], far]) > 1  # one has come before, the other is not there yet
     assert room([far, gone], [far, hands[1]]) < 0
@@ -114,9 +114,8 @@ def test_the_room_of_an_obstacle_that_comes_is_that_of_the_arm_as_it_is_then(ben
 
 def test_figures_of_a_run_are_relative_to_the_limits(bench):
     q = bench.starts[0] + np.cumsum([[0.0], [0.01], [0.03], [0.03]], axis=0) * np.eye(6)[0]
-    crossing = reactive.Crossing(0, 0.01, np.array(4 * [[[3.0, 0.0, 0.0]]]), [UPRIGHT])
-    run = reactive.Run(list(q), [0.001, 0.003])
-    found = reactive.figures_of(bench, crossing, run, 0.005)
+    crossing = reactive.Crossing(0, 0.005, 0.01, np.array(4 * [[[3.0, 0.0, 0.0]]]), [UPRIGHT])
+    found = reactive.figures_of(bench, crossing, q) | {"ticks": np.array([0.001, 0.003])}
     assert found["velocity"] == pytest.approx(3.0 / bench.robot.velocity_limits[0])
     assert found["acceleration"] == pytest.approx(200 / ControllerSettings().acceleration)
     assert found["lost"] == pytest.approx(0.015) and found["clearance"] > 2e3

@@ -6,12 +6,12 @@ from functools import partial
 
 import numpy as np
 import pytest
-from recorded import TIMES, bag, path_of, table
+from recorded import TIMES, bag, path_of, table, zipped
 
 from dt_viz.errors import FormatError
 from dt_viz.files import recordings
+from dt_viz.files.reading import read_upload
 from dt_viz.files.recordings import NO_COLUMN, Recordings, read_recordings
-from dt_viz.files.uploads import read_upload
 
 HEADER = ("t", "x", "y", "z")
 JOINT_NAMES = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "wrist_yaw")
@@ -22,14 +22,6 @@ def read(*files, answers=None, process=False):
     """What is read of files, each a name and its content."""
     reader = partial(read_upload, Recordings) if process else read_recordings
     return reader([*files], answers=answers or {}, joint_names=[*JOINT_NAMES])
-
-
-def zipped(files, compression=zipfile.ZIP_STORED):
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w", compression) as archive:
-        for name, content in files.items():
-            archive.writestr(name, content)
-    return file.getvalue()
 
 
 def npy(array):

@@ -2,10 +2,13 @@
 
 import numpy as np
 import pytest
+from checkpoints import asked_at_checkpoints
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dt_viz.flows.fields import GaussianGrid, GridRBF, PlacedField
+from dt_viz.errors import UnwantedError
+from dt_viz.flows.fields import GaussianGrid, GridRBF
+from dt_viz.flows.integrators import DORMAND_PRINCE, EULER, IMPLICIT_EULER
 
 seeds = st.integers(0, 2**32 - 1)
 dims = st.sampled_from([2, 3])
@@ -19,12 +22,6 @@ def random_grid(rng, dim, sigma=0.4):
 def random_field(rng, dim):
     grid = random_grid(rng, dim)
     return GridRBF(grid, rng.normal(size=(grid.num_points, dim)))
-
-
-def random_rotation(rng, dim):
-    q, r = np.linalg.qr(rng.normal(size=(dim, dim)))
-    q = q * np.sign(np.diag(r))
-    return q if np.linalg.det(q) > 0 else q[:, ::-1]
 
 
 @given(seeds, dims)
@@ -49,21 +46,29 @@ def test_a_covering_grid_covers_its_points_no_coarser_than_asked(seed, dim, sigm
         assert np.diff(axis).max() <= spacing * sigma * (1 + 1e-6)
 
 
+@pytest.mark.parametrize("method", [EULER, IMPLICIT_EULER, DORMAND_PRINCE])
+def test_a_long_flow_has_checkpoints_at_which_it_may_end_and_they_change_nothing(monkeypatch, method):
+    rng = np.random.default_rng(0)
+    field, s, U, asked = random_field(rng, 2), rng.uniform(-1, 1, (300, 2)), rng.normal(size=(300, 2, 2)), []
+    flow = lambda: field.carried(s, U, method, 0.1, 5, 1e-6)  # noqa: E731
+    with asked_at_checkpoints(lambda: asked.append(True)):
+        whole, tangents = flow()
+        assert not asked
+        monkeypatch.setattr("dt_viz.flows.fields.MOST_AT_ONCE", 130 * field.weights.size)
+        again, again_tangents = flow()
+    assert len(asked) == (5 if method != DORMAND_PRINCE else 3)  # 64 points at a time at least, or 128
+    np.testing.assert_allclose(again, whole, rtol=0, atol=1e-14)
+    assert tangents is not None and again_tangents is not None
+    np.testing.assert_allclose(again_tangents, tangents, rtol=0, atol=1e-13)
+
+    def end():
+        raise UnwantedError
+
+    with asked_at_checkpoints(end), pytest.raises(UnwantedError):
+        flow()
+
+
 def test_weights_of_another_shape_are_refused():
     grid = random_grid(np.random.default_rng(0), 2)
     with pytest.raises(ValueError, match=r"weights have shape \(12, 3\); the grid needs \(12, 2\)"):
         GridRBF(grid, np.zeros((grid.num_points, 3)))
-
-
-@given(seeds, dims, st.floats(0.05, 20))
-def test_a_placed_field_is_the_field_of_the_moved_turned_and_scaled_thing(seed, dim, scale):
-    rng = np.random.default_rng(seed)
-    inner, R, o = random_field(rng, dim), random_rotation(rng, dim), rng.normal(size=dim)
-    placed = PlacedField(inner, o, scale * R)
-    u = rng.uniform(-1, 1, (8, dim))  # in the thing's own frame
-    world = np.stack([o + scale * (R @ point) for point in u])
-    expected = np.stack([scale * (R @ v) for v in inner(u)])
-    np.testing.assert_allclose(placed(world), expected, rtol=0, atol=1e-11 * scale)
-    (found, J), (_, own) = placed.with_jacobian(world), inner.with_jacobian(u)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-11 * scale)
-    np.testing.assert_allclose(J, np.stack([R @ DV @ R.T for DV in own]), rtol=0, atol=1e-11)

@@ -2,16 +2,12 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from laws.registry import bent
 from scipy.integrate import solve_ivp
 
 from dt_viz.flows.fields import GaussianGrid, GridRBF
 from dt_viz.flows.integrators import DORMAND_PRINCE, EULER, IMPLICIT_EULER, RK4, carried
 from dt_viz.obstacles.shapes import Sphere
-
-seeds = st.integers(0, 2**32 - 1)
 
 
 def tangents(*arguments):
@@ -70,23 +66,6 @@ def test_adaptive_is_not_deceived_by_a_first_step_that_is_far_too_long(duration)
         reference, _ = carried(field, s, None, RK4, duration, 300)
         for tolerance, largest in ((2e-5, 1e-3), (2e-9, 1e-7)):
             assert np.abs(adaptively(field, s, duration, tolerance) - reference).max() < largest
-
-
-@pytest.mark.parametrize("distance", [0.0, 1e-9, 1e-6, 1e-3, 1e-2])
-def test_adaptive_steps_are_hardly_ever_tried_in_vain(distance):
-    """The first step fits the steep core at once."""
-    field = Sphere((0.0, 0.0, 0.0), 0.15).field("free-space", 6.0)
-    adaptively(field, np.array([[distance, 0.0, 0.0]]), -1.0, 2e-5, steps=9)
-
-
-@settings(max_examples=8)
-@given(seeds, st.floats(-1.0, 1.0))
-def test_adaptive_points_do_not_depend_on_their_batch(seed, duration):
-    rng = np.random.default_rng(seed)
-    field, s = bent(2, seed, 1.0), rng.uniform(-1.5, 1.5, (8, 2))
-    together = adaptively(field, s, duration, 1e-7)
-    alone = np.concatenate([adaptively(field, point[None], duration, 1e-7) for point in s])
-    np.testing.assert_allclose(together, alone, rtol=0, atol=1e-12)
 
 
 def test_adaptive_takes_no_points_and_no_time_and_leaves_its_arguments_alone():

@@ -80,28 +80,6 @@ def test_a_rollout_that_rests_is_sampled_at_even_fractions():
     np.testing.assert_allclose(bundle.fraction[5:], np.linspace(0, 1, 5), atol=1e-12)
 
 
-def test_splitting_puts_each_sample_to_its_rollout():
-    bundle = evenly_sampled(bent, 3, 20)
-    parts = bundle.split(bundle.index.astype(float))
-    assert [set(part) for part in parts] == [{0}, {1}, {2}]
-    np.testing.assert_array_equal(np.concatenate(bundle.split(bundle.positions)), bundle.positions)
-
-
-def test_refinement_looks_seldom_where_a_gap_is_stretched_unevenly():
-    """A round costs more than a few samples too many."""
-    rounds = []
-
-    def evaluate(index, fraction):
-        rounds.append(len(index))
-        return bent(index, fraction)
-
-    rough = evenly_sampled(bent, 3, 12)
-    fine = refined(rough, evaluate, 0.01)
-    assert len(rounds) == 2
-    needed = sum(np.ceil(gap.sum() / 0.01) for gap in gaps(fine))
-    assert len(fine.index) < 2 * needed
-
-
 def test_refinement_puts_no_more_samples_than_needed_where_gaps_are_alike():
     rough = evenly_sampled(straight, 3, 12)
     fine = refined(rough, straight, 0.01)

@@ -5,11 +5,11 @@ import pytest
 from oracles import carried_by_arrays
 from scipy.special import eval_hermite, expit
 
-from dt_viz.avoidance.bias_fields import RegionField, Shift
+from dt_viz.avoidance.bias import RegionField, Shift
 from dt_viz.avoidance.sideways import Sideways
 from dt_viz.flows.fields import GaussianGrid, GridRBF, PlacedField, PointField, Projected, Sum
 from dt_viz.flows.integrators import DORMAND_PRINCE, EULER, IMPLICIT_EULER, RK4, carried
-from dt_viz.kernels.gaussians import LANES, exponential
+from dt_viz.kernels.fields import LANES, exponential
 from dt_viz.obstacles.occupancy import GENERATORS, AvoidanceField, OccupancyMap
 
 COUNTS = [1, 2, 5, LANES, 2 * LANES + 7]

@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 
 import dt_viz
 from dt_viz.avoidance.arm_field import ArmField, GradientField, JointLimits, WholeArmField
-from dt_viz.avoidance.bias import BiasPoint
-from dt_viz.avoidance.bias_fields import Shift, unit_field
+from dt_viz.avoidance.bias import BiasPoint, Shift, unit_field
 from dt_viz.avoidance.hand import Avoidance
 from dt_viz.avoidance.sideways import Sideways
 from dt_viz.avoidance.transform import Transform
@@ -25,11 +24,11 @@ from dt_viz.flows.integrators import EULER, IMPLICIT_EULER
 from dt_viz.flows.systems import Attractor
 from dt_viz.learning.timing import TimedAttractor
 from dt_viz.obstacles.clouds import Cloud
-from dt_viz.obstacles.learned_maps import unit_map
-from dt_viz.obstacles.occupancy import AvoidanceField
+from dt_viz.obstacles.occupancy import AvoidanceField, unit_map
 from dt_viz.obstacles.shapes import (
     ORIGIN,
     Box,
+    Capsule,
     CloudObstacle,
     Cylinder,
     MeshObstacle,
@@ -42,8 +41,7 @@ from dt_viz.obstacles.solids import Solid
 from dt_viz.robot.models import HOME, load_jaco
 from dt_viz.scenario.tasks import DRAWING_AXES
 
-Points = Callable[[int], np.ndarray]
-"""Gives so many points (num, d), always the same."""
+Points = Callable[[int], np.ndarray]  # gives so many points (num, d), always the same
 
 
 def product_classes() -> Iterator[type]:
@@ -182,16 +180,12 @@ class Map:
     """A diffeomorphism, and how exactly it is one."""
 
     transform: Diffeomorphism
-    back: float
-    """Largest error of there and back."""
+    back: float  # largest error of there and back
     group: float | None = None
     """Largest difference of scaled(a)∘scaled(b) from scaled(a + b); None where that is not promised."""
-    points: Points | None = None
-    """Points where it is known; None is the box from −0.8 to 0.8."""
-    step: float = 1e-3
-    """Step of the differences that its Jacobian is compared with."""
-    scales: bool = True
-    """Whether scaled(0) is the identity: changes of units stay."""
+    points: Points | None = None  # points where it is known; None is the box from −0.8 to 0.8
+    step: float = 1e-3  # step of the differences that its Jacobian is compared with
+    scales: bool = True  # whether scaled(0) is the identity: changes of units stay
 
     def some(self, num: int) -> np.ndarray:
         return (self.points or uniform(self.transform.dim))(num)
@@ -297,8 +291,7 @@ BASES: dict[str, tuple[Attractor, Points]] = {
     "phased": (phased(3), states(3)),
     "phased for each condition": (phased(2, 3, 1.5), states(2, 3)),
 }
-ONLY_AT_A_MOMENT = {"Frozen"}
-"""Base systems that are the true one at a moment only."""
+ONLY_AT_A_MOMENT = {"Frozen"}  # base systems that are the true one at a moment only
 
 # --- obstacles ---
 
@@ -339,7 +332,8 @@ OBSTACLES: dict[str, Obstacle] = {
     "cylinder": Cylinder(PLACE, 0.12, 0.2),
     "disc": Cylinder(PLACE, 0.2, 0.03, TILTED),
     "round mesh": MeshObstacle(PLACE, as_solid(trimesh.creation.icosphere(4, 0.075)), TILTED),
-    "capsule": MeshObstacle(PLACE, as_solid(trimesh.creation.capsule(0.1, 0.04)), TILTED),
+    "capsule": Capsule(PLACE, 0.08, 0.18, TILTED),
+    "long capsule": Capsule(PLACE, 0.04, 0.3, TILTED),
     "torus": MeshObstacle(PLACE, as_solid(trimesh.creation.torus(0.06, 0.025)), TILTED),
     "angle": MeshObstacle(PLACE, ANGLE),
     "U": MeshObstacle(PLACE, U_SHAPE, TILTED),
@@ -348,7 +342,7 @@ OBSTACLES: dict[str, Obstacle] = {
     "labelled cloud": CloudObstacle(PLACE, LABELLED),
     "larger cloud": CloudObstacle(PLACE, LABELLED, TILTED).resized(0.2),
 }
-SIMILAR = {"round mesh", "capsule", "labelled cloud"}
+SIMILAR = {"round mesh", "labelled cloud"}
 """Obstacles that behave as others do; they are swept over only."""
 
 # --- transforms ---

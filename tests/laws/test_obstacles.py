@@ -8,10 +8,10 @@ import trimesh
 from laws.registry import OBSTACLES, PLACE, SIMILAR, TILTED
 from oracles import central_differences
 
-from dt_viz.avoidance.clearing import clearing_duration
+from dt_viz.avoidance.avoidance import clearing_duration
 from dt_viz.flows.diffeomorphisms import Flow
-from dt_viz.obstacles.covers import MAX_BALLS
 from dt_viz.obstacles.shapes import SHAPES, UPRIGHT, Box, CloudObstacle, MeshObstacle, Obstacle, rotation
+from dt_viz.obstacles.solids import MAX_BALLS
 from dt_viz.obstacles.union import Union
 
 

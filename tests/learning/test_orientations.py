@@ -11,7 +11,7 @@ from dt_viz.flows.rotations import apart, exponential, logarithm, mean_orientati
 from dt_viz.learning.augmented import fit_augmented
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.inspection import Repaired, repair
-from dt_viz.learning.patterns import AugmentedSettings, StartProcess
+from dt_viz.learning.patterns import StartProcess
 from dt_viz.learning.preparation import PreparationSettings, prepare
 
 RNG = np.random.default_rng(5)
@@ -62,11 +62,6 @@ class TestRotations:
         noisy = quaternions(rotation(turned) * Rotation.from_rotvec(2e-3 * RNG.normal(size=(200, 3))))
         found = logarithm(GOAL, noisy)
         assert np.abs(np.diff(found, axis=0)).max() < 1 and apart(exponential(GOAL, found), noisy).max() < 0.03
-
-    def test_a_turn_of_the_world_leaves_vectors_as_they_are(self):
-        world, turned = Rotation.from_rotvec([1.0, -2.0, 0.5]), hand(TAKES[0])
-        both = [quaternions(world * rotation(q)) for q in (GOAL, turned)]
-        np.testing.assert_allclose(logarithm(*both), logarithm(GOAL, turned), atol=1e-7)
 
 
 class TestSystem:
@@ -124,14 +119,6 @@ class TestMotion:
             assert np.median(off) < 1.5 and off.max() < 5
             assert apart(hand(path)[-1:], hand(motion.rollouts()[0])[-1]).max() < 1e-7
 
-    def test_signs_of_quaternions_change_nothing(self):
-        flipped = [
-            Demonstration(t.times, t.positions, t.name, RNG.choice([-1.0, 1.0], (150, 1)) * hand(t)) for t in TAKES
-        ]
-        for one, other in zip(dt.fit(TAKES).rollouts(), dt.fit(flipped).rollouts(), strict=True):
-            assert apart(hand(one), hand(other)).max() < 1e-6
-            np.testing.assert_allclose(one.positions, other.positions, atol=1e-9)
-
     def test_a_turn_of_the_world_turns_the_motion(self):
         world = Rotation.from_rotvec([0.4, -0.7, 1.1])
         there = [
@@ -182,13 +169,6 @@ class TestMotion:
         with pytest.raises(dt.DataError, match="orientations of '0'"):
             dt.fit([Demonstration(TAKES[0].times, TAKES[0].positions, "0", np.zeros((150, 4)))])
 
-    def test_places_without_orientations_are_learned_as_ever(self):
-        bare = [Demonstration(take.times, take.positions, take.name) for take in TAKES]
-        settings = [AugmentedSettings(turn_length=length) for length in (0.1, 3.0)]
-        one, other = (dt.fit(bare, state="augmented", augmented=each).rollouts()[0] for each in settings)
-        np.testing.assert_array_equal(one.positions, other.positions)
-        assert one.orientations is None
-
 
 class TestOthersStarts:
     """What turns are worth from a start that was not demonstrated."""
@@ -202,7 +182,7 @@ class TestOthersStarts:
             path = np.outer(1 - u, np.array([0.3, 0.0, 0.2]) + aside) + np.outer(np.sin(np.pi * u), [0.0, 0.1, 0.1])
             turn = np.outer(1 - u, np.array([0.5, -0.8, 0.3]) + (slope @ aside if explained else scattered))
             takes.append(Demonstration(4 * u, path, f"{k}", exponential(GOAL, turn)))
-        followed = follow(takes, fit_augmented, len(takes))
+        followed = [each for k in range(len(takes)) for each in follow(takes, fit_augmented, range(k, k + 1))]
         return np.mean([each.degrees["learned"] for each in followed]) / np.mean(
             [each.degrees["mean"] for each in followed]
         )

@@ -26,8 +26,7 @@ fit that turns far, with room to spare."""
 SADDLE = 1e-5
 """The same for the plain fit of mirrored demonstrations, which has to leave a symmetric saddle: up to 2.6e-6 was
 measured there, and 1.3e-9 in all other cases of the quick tests."""
-BESIDE = 0.02
-"""Deviation of starts beside the demonstrated ones, relative to the extent."""
+BESIDE = 0.02  # deviation of starts beside the demonstrated ones, relative to the extent
 FITTED_ELSEWHERE = ("draw_s", "draw_g", "push_box")
 
 
@@ -53,16 +52,11 @@ def motions(demonstrations, state, order=None):
     return np.stack(found, axis=1)
 
 
-def rounded(demonstrations, rng):
-    """The demonstrations with other rounding."""
-    noise = NOISE * extent(demonstrations)
-    return [replace(d, positions=d.positions + noise * rng.normal(size=d.positions.shape)) for d in demonstrations]
-
-
 def assert_repeated(demonstrations, state, seed=0, alike=ALIKE):
     """What is learned does not change with the rounding of demonstrations and with their order."""
-    rng = np.random.default_rng(seed)
-    found = motions(rounded(demonstrations, rng), state, rng.permutation(len(demonstrations)))
+    rng, noise = np.random.default_rng(seed), NOISE * extent(demonstrations)
+    rounded = [replace(d, positions=d.positions + noise * rng.normal(size=d.positions.shape)) for d in demonstrations]
+    found = motions(rounded, state, rng.permutation(len(demonstrations)))
     assert np.abs(found - motions(demonstrations, state)).max() < alike * extent(demonstrations)
 
 

@@ -9,8 +9,8 @@ from drawings import frechet, path_from
 
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.imitation import Imitation, ImitationError, ImitationSettings, fit
-from dt_viz.learning.preparation import Motions, prepare
-from dt_viz.learning.state import ChoiceSettings, learn
+from dt_viz.learning.preparation import prepare
+from dt_viz.learning.state import learn
 from dt_viz.learning.store import FitStore
 
 S = np.linspace(0, 1, 150)[:, None]
@@ -90,16 +90,6 @@ def test_what_crosses_is_learned_in_the_augmented_state_without_a_plain_fit_to_a
     assert plain.settings == []
 
 
-@pytest.mark.long
-def test_a_choice_that_has_seen_what_it_is_judged_by_is_another_one(monkeypatch):
-    demonstrations = of_a_hand(6)
-    assert learn(demonstrations).state == "augmented"
-    every = prepare(demonstrations)
-    only = Motions.only
-    monkeypatch.setattr(Motions, "only", lambda motions, which: every if len(which) > 2 else only(motions, which))
-    assert learn(demonstrations).state == "plain"
-
-
 def test_what_both_would_have_given_is_said():
     chosen = learn(of_a_hand(6))
     assert chosen.choice
@@ -146,14 +136,6 @@ def test_settings_of_the_plain_fit_do_not_change_the_state(poor):
 
 
 @pytest.mark.long
-def test_order_and_what_is_shown_twice_do_not_change_the_choice():
-    for demonstrations, state in ((into_a_channel(5), "plain"), (of_a_hand(5), "augmented")):
-        assert learn(demonstrations[::-1]).state == state
-    twice = learn([into_a_channel(1)[0]] * 4)
-    assert twice.state == "plain"  # both are nearer than it matters
-
-
-@pytest.mark.long
 def test_progress_grows_and_ends_at_the_whole():
     for demonstrations in (into_a_channel(4), of_a_hand(4)):
         reports = []
@@ -180,10 +162,3 @@ def test_scatter_without_gaps_is_one_pattern_and_two_ways_are_two():
         assert imitation.known_labels == ()
     ways = crossings()["left and right from one start"].demonstrations
     assert learn([w for w in ways for _ in range(3)], state="augmented").known_labels == (-1.0, 1.0)
-
-
-@pytest.mark.long
-def test_the_settings_of_the_choice_are_what_they_say():
-    demonstrations = into_a_channel(6)
-    assert learn(demonstrations, choice=ChoiceSettings(alike=0.1)).state == "augmented"
-    assert learn(of_a_hand(6), choice=ChoiceSettings(fewest=7)).state == "plain"

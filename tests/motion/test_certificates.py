@@ -17,7 +17,7 @@ from dt_viz.flows.systems import Attractor
 from dt_viz.motion.certificates import MAX_OFF, MAX_OFF_POSTURE, Certificates, DrawnSamples, certified
 from dt_viz.motion.following import arm_samples
 from dt_viz.motion.stack import Solution
-from dt_viz.robot.retiming import within_velocity_limits
+from dt_viz.robot.joint_trajectory import within_velocity_limits
 from dt_viz.scenario.scenario import View
 from dt_viz.session.certify import certify
 from dt_viz.session.engine import Engine
@@ -190,18 +190,6 @@ def test_samples_nearer_than_rounding_need_not_fall(rise, falls):
     fraction[20] -= 1e-9
     levels[21, 0] += rise * (RAYS.z0[0] - BASE.goal) / np.linalg.norm(RAYS.z0[0] - BASE.goal)
     assert certificates_of(Bundle(index, fraction, levels)).lyapunov_falls is falls
-
-
-# --- what is told ---
-
-
-def test_what_follows_from_a_cause_that_is_said_is_not_told_beside_it_but_known():
-    cause = MotionWarning(Kind.FOLDS, "a step folds", "Bias 1")
-    follows = MotionWarning(Kind.NOT_FALLING, "it rises")
-    known = KNOWN.warning(follows, cause, cause)
-    assert known.found == (BEFORE, follows, cause, cause)
-    assert known.warnings == (BEFORE, cause)
-    assert KNOWN.warning(follows).warnings == (BEFORE, follows)
 
 
 # --- motions other than those that were computed ---

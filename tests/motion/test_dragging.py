@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from scenes import changed, frame_at
 
-from dt_viz.avoidance.arm_settings import WholeArmSettings
-from dt_viz.avoidance.avoidance import ArmAvoidance
-from dt_viz.avoidance.detour import DETOUR, escape_directions
+from dt_viz.avoidance.arm_field import WholeArmSettings
+from dt_viz.avoidance.detour import DETOUR
 from dt_viz.avoidance.passing import ANEW
 from dt_viz.metrics import discrete_frechet, resample_by_arc_length
 from dt_viz.motion.following import Follower
@@ -21,8 +20,7 @@ from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.scenario.scenario import View
 from dt_viz.session.frame import Stage
 
-DIAMETER = 0.15
-"""Diameter of the dragged ball, metres."""
+DIAMETER = 0.15  # diameter of the dragged ball, metres
 JUMP = DIAMETER / 2
 """Distance of a rollout from that in the frame before that is not wanted, metres: one that changes sides moves by about
 the ball's diameter."""
@@ -185,34 +183,11 @@ def test_a_scenario_with_its_passing_gives_one_motion_after_any_history_and_on_a
 # --- the arm ---
 
 
-def test_the_escape_before_comes_first_unless_it_costs_much_more():
-    rng = np.random.default_rng(0)
-    radius, tangents = np.full(3, 0.04), np.zeros((1, 3))
-    for depth in (0.002, 0.05):  # of the middle of the arm beside that of the obstacle
-        points = rng.normal(size=(3, 3, 2)) * 0.002 + np.array([0, 0, 2 + depth])[:, None]
-        ball = Sphere((0.0, 0.0, 2.0), 0.12)
-        usual = escape_directions(points, radius, tangents, ball)
-        found = escape_directions(points, radius, tangents, ball, previous=np.array([0.0, 0.0, -1.0]))
-        assert usual[0][2] > 0.9
-        nearest = min(found, key=lambda direction: direction[2])
-        cheap = (0.1 + depth) < DETOUR.staying * (0.1 - depth)
-        assert cheap == (depth < 0.01)
-        assert nearest is found[0 if cheap else 1] and found[1 if cheap else 0][2] == pytest.approx(usual[0][2])
-
-
 def beside_goal(nominal, distance):
     """What the arm avoids: a ball on the motion at this distance from the goal, metres."""
     mean = np.mean(nominal.paths, axis=0)
     x, y, z = mean[np.argmin(np.abs(np.linalg.norm(mean - nominal.goal, axis=1) - distance))]
     return Sphere((float(x), float(y), float(z)), 0.15)
-
-
-def test_a_reference_posture_is_kept_while_it_leaves_as_many_starts_free(engine, robot, initial):
-    nominal, follower = engine.nominal(initial("push_box")), Follower(robot)
-    near, farther = (ArmAvoidance((beside_goal(nominal, distance),)) for distance in (0.11, 0.2))
-    posture = follower.admission(nominal, near).nominal.posture
-    assert posture is not None and follower.admission(nominal, farther).nominal.posture is None
-    assert follower.admission(nominal, farther, posture).nominal.posture == posture
 
 
 def test_a_reference_posture_is_kept_only_while_something_is_in_the_way(engine, robot, initial):

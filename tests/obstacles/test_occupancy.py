@@ -8,9 +8,9 @@ from oracles import central_differences
 from scipy.special import expit
 
 from dt_viz.flows.diffeomorphisms import Flow
-from dt_viz.obstacles.learned_maps import unit_map
-from dt_viz.obstacles.occupancy import GENERATORS, AvoidanceField, fit_occupancy, sample_labels
-from dt_viz.obstacles.shapes import ORIGIN, Sphere
+from dt_viz.obstacles.occupancy import GENERATORS, AvoidanceField, fit_occupancy, sample_labels, unit_map
+from dt_viz.obstacles.shapes import ORIGIN, Sphere, as_point
+from dt_viz.obstacles.union import Union
 
 seeds = st.integers(0, 2**32 - 1)
 BALL = unit_map(Sphere(ORIGIN, 2.0))
@@ -143,3 +143,25 @@ def test_a_moved_and_grown_sphere_has_the_moved_and_grown_field(seed, diameter, 
     field = Sphere((x, y, z), diameter).field(generator, 6.0)
     expected = diameter / 2 * AvoidanceField(BALL, generator, 6.0)(local)
     np.testing.assert_allclose(field(np.array([x, y, z]) + diameter / 2 * local), expected, rtol=0, atol=1e-12)
+
+
+# unions beside the laws (tests/laws)
+
+
+@pytest.mark.long
+@given(st.integers(0, 2**32 - 1), st.integers(2, 4))
+def test_it_is_moved_hardly_farther_than_to_the_nearest_place(seed, num):
+    """Also where two spheres hardly overlap, and where leaving one leads deeper into the next."""
+    rng = np.random.default_rng(seed)
+    spheres = [Sphere(as_point(rng.normal(0, 0.05, 3)), float(rng.uniform(0.08, 0.2))) for _ in range(num)]
+    together, directions = Union(tuple(spheres)), rng.normal(size=(3000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    surfaces = np.concatenate([sphere.position + sphere.radius * directions for sphere in spheres])
+    surface = surfaces[together.signed_distance(surfaces) >= -1e-6]
+    points = rng.normal(0, 0.05, (50, 3))
+    points = points[together.signed_distance(points) < 0]
+    free = together.nearest_free(points)
+    assert (together.signed_distance(free) >= -1e-6).all()
+    moved = np.linalg.norm(free - points, axis=1)
+    nearest = np.linalg.norm(surface - points[:, None], axis=-1).min(axis=1)
+    assert (moved < 1.1 * nearest + 0.002).all()

@@ -6,13 +6,13 @@ from scenes import avoiding, biases, changed, frame_at
 
 from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.avoidance.hand import Avoidance
-from dt_viz.control.section import Section
+from dt_viz.control.courses import Section
 from dt_viz.flows.augmented_systems import frozen
 from dt_viz.flows.diffeomorphisms import Identity
 from dt_viz.motion.stack import FINE
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
-from dt_viz.pictures.arm_field import Lattice
+from dt_viz.pictures.slice_fields import Lattice
 from dt_viz.scenario.scenario import Layer
 from dt_viz.session.drawing import lattice, rest, system_of, velocities
 from dt_viz.session.frame import Stage
@@ -50,15 +50,6 @@ def test_arrows_are_the_hand_s_velocities_of_the_pulled_back_system(scene):
     speed = np.linalg.norm(expected, axis=1)
     off = np.linalg.norm(found.velocities - expected, axis=1) / speed
     assert np.median(off) < 0.02 and off.max() < 0.2
-
-
-def test_without_avoidance_the_field_is_the_one_below_where_the_arm_reaches(scene):
-    engine, scenario, below, _ = scene
-    robot, reference = engine.follower.robot, engine.follower.reference(engine.nominal(scenario))
-    same = Lattice.of(below.points, robot, reference).carried(below.velocities, Identity(6), robot, Union(()))
-    assert len(same.points) == len(below.points)
-    np.testing.assert_allclose(same.points, below.points, atol=1e-4)
-    np.testing.assert_allclose(same.velocities, below.velocities, atol=0.05 * np.abs(below.velocities).max())
 
 
 def test_there_is_an_arrow_where_the_hand_moves_and_the_arm_reaches(scene):

@@ -10,16 +10,15 @@ from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.flows.rollouts import Rays
 from dt_viz.flows.systems import Attractor
 from dt_viz.motion.stack import LIVE, build_stack
-from dt_viz.obstacles.shapes import Sphere
 from dt_viz.pictures.panels import Fit
-from dt_viz.scenario.panels import BASE_PANEL, Panel, directions, offsets
 from dt_viz.scenario.scenario import View
+from dt_viz.scenario.slices import BASE_PANEL, Panel, directions, offsets
 from dt_viz.scenario.stack import IMITATION, plane_of, side_by_side, switched
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.frame import Stage
 from dt_viz.ui.scene.palette import DARK, LIGHT
-from dt_viz.ui.scene.panels import Panels
 from dt_viz.ui.scene.picture import Look
+from dt_viz.ui.scene.slice_layers import Panels
 
 BIAS = "Bias 1"
 
@@ -151,29 +150,15 @@ def test_side_by_side_are_the_base_attractor_and_the_levels_below_the_top(engine
     assert side_by_side(avoiding("draw_s", ())) == (BASE_PANEL,)
 
 
-def test_only_what_a_drag_changes_is_drawn_again(engine, initial, scene):
-    scenario = biased(engine, initial)
-    shown = (*side_by_side(scenario), Panel("Avoidance"))
-    x, y, z = scenario.obstacles[0].position
-    panels = Panels(scene)
-    panels.draw(frame_of(engine, scenario, *shown), Look())
-    before = [(nodes.lines["streamlines"].node.points, nodes.rollouts.node.vertices) for nodes in panels.panels]
-    panels.draw(frame_of(engine, changed(scenario, obstacles=(Sphere((x, y, z + 0.01), 0.15),)), *shown), Look())
-    same = [
-        nodes.lines["streamlines"].node.points is streamlines and nodes.rollouts.node.vertices is rollouts
-        for nodes, (streamlines, rollouts) in zip(panels.panels, before, strict=True)
-    ]
-    assert same == [True, True, False, False, True]  # the bias is built below the avoidance, but for other samples
-    panels.draw(frame_of(engine, scenario, BASE_PANEL, field=False), Look())
-    assert [nodes.frame.visible for nodes in panels.panels] == [True, True, False, False, False]
-
-
-def test_panels_take_the_theme_also_those_that_are_drawn_later(engine, initial, scene):
+def test_panels_take_the_theme_also_those_that_are_drawn_later_and_are_hidden_when_there_are_fewer(
+    engine, initial, scene
+):
     panels, scenario = Panels(scene), biased(engine, initial)
-    for dark, shown in ((True, [BASE_PANEL]), (False, [BASE_PANEL, Panel(BIAS)])):
-        theme = DARK if dark else LIGHT
+    for theme, shown in ((DARK, [BASE_PANEL]), (LIGHT, [BASE_PANEL, Panel(BIAS)]), (DARK, [BASE_PANEL])):
         panels.draw(frame_of(engine, scenario, *shown), Look(theme))
-        assert {tuple(nodes.lines["streamlines"].node.colors) for nodes in panels.panels} == {theme.streamline}
+        visible = [nodes for nodes in panels.panels if nodes.frame.visible]
+        assert len(visible) == len(shown) + 1
+        assert {tuple(nodes.lines["streamlines"].node.colors) for nodes in visible} == {theme.streamline}
 
 
 def test_rollouts_on_panels_are_grey_while_there_is_no_motion(engine, initial, scene):

@@ -127,15 +127,6 @@ class TestTracking:
         noise = robot.clip(rng.uniform(-np.pi, 2 * np.pi, cold.q.shape))
         np.testing.assert_allclose(track(robot, path, cold.q[0], initial=noise).q, cold.q, atol=0.01)
 
-    def test_dragging_out_and_back_leaves_no_trace(self, robot):
-        path = np.linspace([0.3, -0.45, 0.25], [-0.3, -0.45, 0.25], 100)
-        bump = np.exp(-(np.linspace(-2.5, 2.5, 100) ** 2))[:, None] * np.array([0.0, -1.0, 0.3])
-        first = previous = self.follow(robot, path)
-        for pull in np.concatenate([np.linspace(0.0, 0.8, 30), np.linspace(0.8, 0.0, 30)]):
-            previous = track(robot, path + pull * bump, first.q[0], initial=previous.q)
-            assert inside_limits(robot, previous.q)
-        np.testing.assert_allclose(previous.q, first.q, atol=0.01)
-
     @pytest.mark.parametrize("far", [[0.0, -1.4, 0.4], [0.9, -0.9, 0.9], [0.0, 0.0, 2.0], [0.5, 1.2, 0.3]])
     def test_out_of_reach_is_reported_and_stays_at_the_border(self, robot, far):
         near = np.array([0.0, -0.5, 0.4])
@@ -165,15 +156,6 @@ class TestTracking:
         result = self.follow(robot, stretched)
         assert result.damped[-1]
         assert not result.damped[0]
-
-    def test_several_paths_at_once_equal_one_by_one(self, robot):
-        paths = np.stack([smooth_path(seed) for seed in range(4)])
-        starts = np.stack([inverse_kinematics(robot, path[0]) for path in paths])
-        together = track(robot, paths, starts)
-        assert together.q.shape == (4, 200, robot.num_joints)
-        assert together.error.shape == (4, 200)
-        for path, start, q in zip(paths, starts, together.q, strict=True):
-            np.testing.assert_allclose(q, track(robot, path, start).q, atol=0.01)
 
     @pytest.mark.parametrize("option", ["initial", "reference"])
     def test_shapes_are_checked(self, robot, option):

@@ -1,20 +1,14 @@
 """Arms of five and seven joints: kinematics, avoidance, joint paths and the loop, beside each other in one process."""
 
-# pyright: reportAttributeAccessIssue=false
-# (pinocchio has no stubs)
-
 from dataclasses import replace
 
 import numpy as np
-import pinocchio as pin  # noqa: TID251, here it is the oracle
 import pytest
-from other_arms import MORE, OTHER_ARMS, five_joints, seven_joints, shorter
-from pinocchio_arm import random_configurations
+from other_arms import OTHER_ARMS, five_joints, seven_joints, shorter
 from scenes import avoiding
 
 import dt_viz as dt
 from dt_viz.control.controller import ArmController, Phase
-from dt_viz.flows.rotations import rotation
 from dt_viz.memo import Memo
 from dt_viz.motion.stack import FINE
 from dt_viz.obstacles.shapes import Sphere, as_point
@@ -30,41 +24,7 @@ def arm(request) -> Robot:
     return OTHER_ARMS[request.param]()
 
 
-def as_pinocchio(arm: Robot) -> tuple:
-    """The same chain in pinocchio, and its frame at the end effector."""
-    model, last = pin.Model(), 0
-    for turn, shift, name in zip(arm.joint_rotations, arm.joint_translations, arm.joint_names, strict=True):
-        last = model.addJoint(last, pin.JointModelRZ(), pin.SE3(turn, shift), name)
-    hand = pin.Frame("hand", last, pin.SE3(np.eye(3), arm.end_effector_offset), pin.FrameType.OP_FRAME)
-    index = model.addFrame(hand)
-    return model, model.createData(), index
-
-
 class TestKinematics:
-    def test_places_and_their_derivatives_are_those_of_pinocchio(self, arm):
-        model, data, hand = as_pinocchio(arm)
-        for q in random_configurations(arm, 0, (20,)):
-            rotations, origins = arm.forward_kinematics(q)
-            expected = pin.computeFrameJacobian(model, data, q, hand, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
-            np.testing.assert_allclose(arm.jacobian(q), expected[:3], atol=1e-12)
-            pin.framesForwardKinematics(model, data, q)
-            np.testing.assert_allclose(arm.end_effector(q), data.oMf[hand].translation, atol=1e-12)
-            np.testing.assert_allclose(rotations[-1], data.oMi[arm.num_joints].rotation, atol=1e-12)
-            np.testing.assert_allclose(origins[-1], data.oMi[arm.num_joints].translation, atol=1e-12)
-            axis = data.oMi[arm.num_joints].rotation @ arm.hand_axis
-            np.testing.assert_allclose(arm.hand_direction(q), axis / np.linalg.norm(axis), atol=1e-12)
-            turned = data.oMi[arm.num_joints].rotation @ arm.hand_rotation
-            np.testing.assert_allclose(rotation(arm.hand_orientation(q)).as_matrix(), turned, atol=1e-12)
-
-    def test_where_their_joints_are_at_zero_they_stand_as_the_jaco(self, robot):
-        q = random_configurations(robot, 1, (20,))
-        q[:, -1] = 0
-        places = robot.body.positions(robot, q)
-        for arm, same in ((five_joints(), q[:, :-1]), (seven_joints(), np.insert(q, MORE, 0.0, axis=1))):
-            np.testing.assert_allclose(arm.end_effector(same), robot.end_effector(q), atol=1e-12)
-            np.testing.assert_allclose(arm.hand_direction(same), robot.hand_direction(q), atol=1e-12)
-            np.testing.assert_allclose(arm.body.positions(arm, same), places, atol=1e-12)
-
     def test_a_path_is_followed_on_one_branch(self, arm):
         u = np.linspace(0, 2 * np.pi, 200)
         path = np.array([0.0, -0.5, 0.35]) + 0.12 * np.stack([np.sin(u), 0.3 * np.cos(u), np.sin(2 * u)], axis=1)

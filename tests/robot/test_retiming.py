@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from oracles import used_fraction
 
-from dt_viz.robot.retiming import NEGLIGIBLE, RAMP, within_velocity_limits
+from dt_viz.robot.joint_trajectory import NEGLIGIBLE, RAMP, within_velocity_limits
 
 LIMITS = np.array([0.6, 0.6, 0.6, 0.8, 0.8, 0.8])
 

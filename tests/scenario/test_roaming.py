@@ -16,8 +16,8 @@ from dt_viz.scenario.roaming import (
     crossings,
 )
 from dt_viz.scenario.tasks import TASKS
+from dt_viz.scheduler import Jobs
 from dt_viz.session import player
-from dt_viz.session.jobs import Jobs
 
 SECONDS = np.arange(0, 60, 0.05)
 

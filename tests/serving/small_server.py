@@ -7,12 +7,11 @@ import sys
 import time
 from contextlib import suppress
 
-from dt_viz.serving.board import Board, Share
-from dt_viz.serving.listening import HandedOver, listen
-from dt_viz.serving.supervisor import Supervisor, SupervisorSettings
+from dt_viz.serving import supervisor
+from dt_viz.serving.board import Share
+from dt_viz.serving.supervisor import HandedOver, Supervisor, listen
 
-RECENT = 0.2
-"""Time for which a connection that was handed over counts, seconds."""
+RECENT = 0.2  # time for which a connection that was handed over counts, seconds
 
 
 def main(kind: str = "", silence: str = "10") -> int:
@@ -36,10 +35,9 @@ def main(kind: str = "", silence: str = "10") -> int:
     def ready() -> None:
         print(listening.getsockname()[1], flush=True)
 
+    supervisor.SILENCE, supervisor.RECENT = float(silence), RECENT
     try:
-        return Supervisor(
-            listening, Board(2, 100), work, ready, SupervisorSettings(silence=float(silence), recent=RECENT)
-        ).run()
+        return Supervisor(listening, Share(2, 100), work, ready).run()
     except KeyboardInterrupt:
         return 0
 

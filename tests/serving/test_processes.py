@@ -1,22 +1,25 @@
-"""The demo in two processes: limits hold for both, and a visitor of a process that is killed finds another one."""
+"""The demo in two processes: limits hold for both, a killed process loses no visitor and leaves nothing behind."""
 
 import asyncio
 import json
 import os
 import signal
-import time
+import sys
+import tempfile
 import urllib.error
 import urllib.request
 from contextlib import AsyncExitStack
 from pathlib import Path
 
 import pytest
-from demo import PATIENCE, address, started
+from browsing import take
+from demo import PATIENCE, address, started, until
+from protocol_client import LostError, ProtocolClient
 
 from dt_viz.cli import _num_processes, main
-from dt_viz.evaluate.protocol_client import LostError, ProtocolClient
+from dt_viz.folders import PREFIX, TemporaryFolder
 from dt_viz.serving import supervisor
-from dt_viz.serving.listening import listen
+from dt_viz.serving.supervisor import listen
 
 pytestmark = pytest.mark.skipif(bool(supervisor.several_reason()), reason=supervisor.several_reason())
 
@@ -41,13 +44,6 @@ async def comes(stack, url):
     client = await stack.enter_async_context(ProtocolClient(url))
     await client.look()
     return client
-
-
-async def until(condition):
-    deadline = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        await asyncio.sleep(0.1)
 
 
 async def fill_and_leave(url):
@@ -124,3 +120,29 @@ def test_where_the_system_has_no_several_processes_one_serves_and_it_is_said(mon
     monkeypatch.setattr(supervisor, "several_reason", lambda: "there is no fork")
     assert (_num_processes(3), _num_processes(None), _num_processes(1)) == (1, 1, 1)
     assert capsys.readouterr().err == "dt-viz: --processes: one process serves all, as there is no fork\n"
+
+
+def temporary():
+    return set(Path(tempfile.gettempdir()).glob(f"{PREFIX}*"))
+
+
+@pytest.mark.long
+@pytest.mark.skipif(sys.platform != "linux", reason="folders are locked")
+def test_what_a_killed_server_leaves_is_removed_at_the_next_start_and_nothing_of_a_living_one(cache):
+    async def kill(process, before):
+        async with ProtocolClient(address(process)) as client:
+            assert await client.look_until_drawn(PATIENCE)
+            await client.send_file("Open a file, or drop it here", "take.csv", take())
+            assert await client.wait_for(lambda: temporary() > before, PATIENCE)
+            process.send_signal(signal.SIGKILL)
+            process.wait(PATIENCE)
+
+    with TemporaryFolder() as living:
+        before = temporary()
+        with started(cache, "--processes", "1") as process:
+            asyncio.run(kill(process, before))
+        assert temporary() > before
+        with started(cache) as process:
+            address(process)
+            assert temporary() == before
+    assert temporary() == before - {Path(living)}

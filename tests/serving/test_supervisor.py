@@ -12,15 +12,13 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 import pytest
+from pages import PATIENCE, wait_until
 from serving.small_server import RECENT
 
 from dt_viz.serving.supervisor import several_reason
 
 pytestmark = pytest.mark.skipif(bool(several_reason()), reason=several_reason())
-PATIENCE = 30.0
-"""Seconds that anything may take: the machine may be busy."""
-SMALL = Path(__file__).with_name("small_server.py")
-"""Program that it is tried with."""
+SMALL = Path(__file__).with_name("small_server.py")  # program that it is tried with
 
 
 @contextmanager
@@ -84,13 +82,6 @@ def answer(connection):
     pid, peer = connection.recv(100).split()
     assert peer == b"127.0.0.1"  # known to the process that answers, not only to the one that accepts
     return int(pid)
-
-
-def wait_until(condition):
-    deadline = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.02)
 
 
 def is_alive(pid):
@@ -163,9 +154,8 @@ def test_where_all_stood_still_none_is_a_stuck_one(stopped):
     """As where a machine, or a container, is suspended for a while."""
     with serving("", "1.2") as (process, visits):
         both = visits.both()
-        everyone = [*both, process.pid] if stopped else both
         for signal_ in (signal.SIGSTOP, signal.SIGCONT):
-            for pid in reversed(everyone):  # at first who looks after the others
+            for pid in (*[process.pid] * stopped, *both):  # at first the one that looks after the others
                 with suppress(ProcessLookupError):
                     os.kill(pid, signal_)
             time.sleep(2.0)

@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from arm_files import urdf, write
-from other_arms import seven_joints, shorter
+from other_arms import shorter
 from pages import NoFrames
 from scenes import avoiding
 
@@ -19,14 +19,13 @@ from dt_viz.memo import Memo
 from dt_viz.obstacles.shapes import Box, Cylinder, Sphere
 from dt_viz.robot import making, models
 from dt_viz.robot.models import ARMS, NotStoredError, load_arm
-from dt_viz.robot.placement import follows, resampled
+from dt_viz.robot.placement import follows, is_jaco, resampled
 from dt_viz.robot.urdf import ArmError
-from dt_viz.scenario.paper_scenes import SCENES
+from dt_viz.scenario.paper_scenes import SCENES, offered
 from dt_viz.scenario.relocation import Relocation, relocated
 from dt_viz.scenario.scenario import Layer, Scenario, Start
 from dt_viz.scenario.slices import SlicePose
-from dt_viz.scenario.tasks import TASKS, TaskEntry
-from dt_viz.session import arms as arms_module
+from dt_viz.scenario.tasks import TASKS, Task, TaskEntry
 from dt_viz.session.arms import ArmStore, Engines
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Stage
@@ -196,30 +195,21 @@ class TestChoosing:
         assert (one.fit, one.learned, one.full) != (other.fit, other.learned, other.full)
         assert one.fit != other.fit and one.learned != other.learned and not one.begins_like(other)
 
-    def test_the_engine_in_use_is_kept_and_no_more_than_one_beside_it(self, robot):
-        made = {"first": cast(Engine, Sketches(robot))}
-        engines = Engines(made["first"], lambda name, _: made.setdefault(name, cast(Engine, Sketches(robot))))
-        for name in ("", "a", "", "b", "", "b"):
-            assert engines(name) is made[name or "first"]
-        assert made.keys() == {"first", "a", "b"} and engines.get("a") is None
-        assert engines("a") is made["a"] and engines.get("") is None and engines.get("b") is made["b"]
-
     def test_own_tasks_are_those_of_every_arm_also_of_one_that_is_chosen_later(self, opened):
         session, display, engines, _ = opened
         session.choose_arm("small")
-        own, gone = session.bring(TASKS["draw_c"]())
-        assert gone is None and session.engine.task(own.name) is own
+        own = session.bring(TASKS["draw_c"]())
+        assert session.engine.task(own.name) is own and session.taught[own.name] == (own, "small")
         session.choose_task(own.name)
         session.choose_arm("")
         assert session.scenario.task == own.name and session.task is own
         assert not any("follows it" in text for text in display.said)
-        (*_, (last, gone)) = [session.bring(TASKS["draw_c"]()) for _ in range(4)]
-        assert gone is not None and own.name in session.engine.own  # it is shown
-        assert gone not in engines["small"].own and last.name in engines["small"].own
+        last = session.bring(TASKS["draw_j"]())
+        assert {own.name, last.name} == session.taught.keys() == engines["small"].own.keys()
 
     def test_an_own_task_that_is_moved_for_an_arm_is_said(self, opened):
         session, display, engines, _ = opened
-        own, _ = session.bring(TASKS["draw_c"]())
+        own = session.bring(TASKS["draw_c"]())
         engines["small"].task = lambda _name: own.placed(0.5, (0.1, -0.05, 0.0))
         session.choose_task(own.name)
         choose(session, "small")
@@ -231,7 +221,7 @@ class TestRelocation:
         to = Relocation(0.2, (0.1, 0.0, 0.0))
         assert to.obstacle(Sphere((1.0, 0.0, 0.0), 0.1)) == Sphere((0.3, 0.0, 0.0), 0.04)
         box, cylinder = to.obstacle(Box((0.0, 0.0, 0.0), (0.3, 0.2, 0.1))), to.obstacle(Cylinder((0.0, 0.0, 0.0)))
-        assert (box, cylinder) == (Box((0.1, 0.0, 0.0), (0.06, 0.04, 0.04)), Cylinder((0.1, 0.0, 0.0), 0.04, 0.04))
+        assert (box, cylinder) == (Box((0.1, 0.0, 0.0), (0.06, 0.04, 0.03)), Cylinder((0.1, 0.0, 0.0), 0.04, 0.04))
         cloud = SCENES["cloud"].scenario(TASKS["draw_s"]()).obstacles[0]
         assert replace(cast(Any, to.obstacle(cloud)), position=cloud.position) == cloud
 
@@ -261,18 +251,6 @@ class TestStore:
         own = ArmStore(TASKS, fits, replace(robot, name="mine", title="UR5")).titles
         assert own[""] == "UR5 (given)" and own["ur5"] == "UR5" and own["jaco"] == "JACO"
 
-    def test_visitors_share_an_arm_its_tasks_and_what_is_learned(self, robot, fits, monkeypatch):
-        monkeypatch.setattr(arms_module, "load_aside", lambda name, _progress: replace(seven_joints(), name=name))
-        store = ArmStore(TASKS, fits, robot)
-        one, two, other = store.engine("panda"), store.engine("panda"), store.engine("ur3")
-        assert one is not two and one.follower.robot is two.follower.robot and one._shared is two._shared
-        assert one.task("draw_s") is two.task("draw_s") and other.follower.robot is not one.follower.robot
-        for name in ("ur5", "ur10", "z1"):
-            store.engine(name)
-        assert store.engine("ur3").follower.robot is other.follower.robot
-        assert store.engine("panda").follower.robot is not one.follower.robot  # the oldest of five
-        assert store.engine().follower.robot is robot
-
     def test_recordings_in_space_stay_where_they_are_while_the_arm_follows_them_there(self, robot):
         entry, small = TaskEntry("Own", TASKS["lift_box"], is_recorded=True), shorter(robot, 0.5)
         assert in_reach({"own": entry}, small)["own"] is entry
@@ -284,13 +262,15 @@ class TestStore:
 
     @pytest.mark.long
     def test_an_own_task_is_as_it_was_opened_for_that_arm_and_in_reach_of_another(self, robot, fits):
-        first, other = (Engine(TASKS, fits, arm) for arm in (robot, shorter(robot, 0.5)))
+        first, other = (
+            Engine(TASKS, fits, arm, name=name) for name, arm in (("", robot), ("small", shorter(robot, 0.5)))
+        )
         engines = Engines(first, lambda _name, _progress: other)
-        own, _ = first.bring(TASKS["lift_box"](), "draw_s")
+        own, _ = first.bring(TASKS["lift_box"]())
         assert engines("small") is other and first.task(own.name) is own
         placed = other.task(own.name)
         assert placed is other.task(own.name) and placed.scale < own.scale and placed.title == own.title
-        large, _ = other.bring(TASKS["draw_s"]().placed(2.0, (0.0, 0.0, 0.0)), "draw_s")  # as it was asked for
+        large, _ = other.bring(TASKS["draw_s"]().placed(2.0, (0.0, 0.0, 0.0)), "small")  # as it was asked for
         assert other.task(large.name) is large and first.task(large.name).scale < large.scale
 
     def test_a_task_on_the_table_takes_its_objects_along(self):
@@ -308,6 +288,48 @@ class TestStore:
             assert after.start == pytest.approx(0.5 * cast(Any, before.start) + (0.1, 0.2, 0.0))
             sizes = [np.ptp(thing.surface()[0], axis=0) for thing in (before, after)]
             assert sizes[1] == pytest.approx(0.5 * sizes[0], abs=3e-3)  # walls are as thick
+
+
+# --- tasks are placed where another arm can follow them ---
+
+
+def test_tasks_of_the_jaco_stay_as_they_are(robot):
+    assert in_reach(TASKS, robot) == TASKS
+
+
+@pytest.mark.parametrize("name", ["draw_c", "push_box"])
+def test_another_arm_follows_its_tasks(robot, name):
+    arm = shorter(robot, 0.5)
+    task = in_reach(TASKS, arm)[name]()
+    paths = np.array([path[np.linspace(0, len(path) - 1, 30).astype(int)] for path in task.paths])
+    assert follows(arm, paths)
+    assert task.scale == pytest.approx(0.5 * TASKS[name]().scale)
+    assert in_reach(TASKS, arm)[name].title == TASKS[name].title
+
+
+def test_a_task_out_of_every_reach_stays_and_is_said(robot, caplog):
+    far = TASKS["push_box"]()
+    far = replace(far, origin=np.array([0.0, 0.0, -9.0]))
+    entry = TaskEntry("Far", lambda: far)
+    assert isinstance(found := in_reach({"far": entry}, shorter(robot, 0.5))["far"](), Task)
+    assert found is far
+    assert f"{far.title}: " in caplog.text
+    assert "cannot follow the task anywhere" in caplog.text
+
+
+def test_an_arm_is_the_jaco_by_its_shape_not_by_its_name(robot):
+    assert is_jaco(replace(robot, name="mine"))
+    other = replace(shorter(robot, 0.5), name="jaco")
+    assert not is_jaco(other)
+    assert in_reach(TASKS, other) != TASKS
+
+
+def test_every_scene_that_another_arm_is_offered_can_be_made(robot):
+    tasks = in_reach(TASKS, shorter(robot, 0.5))
+    scenes = offered(tasks, jaco=False)
+    assert {scene.name for scene in offered(tasks)} - {scene.name for scene in scenes} >= {"left_pot", "others_push"}
+    for scene in scenes:
+        assert scene.scenario(tasks[scene.task]()).task == scene.task
 
 
 DESCRIPTIONS = """
@@ -384,14 +406,6 @@ class TestMaking:
         monkeypatch.setattr(making, "start_module", lambda name, *_, **how: write_to("json.tool", "/nowhere", **how))
         with pytest.raises(ArmError, match=r"something that ended their reader"):
             making.load_aside("small", lambda *_: None)
-
-    def test_nobody_wants_it_any_more(self, descriptions):
-        def unwanted(*_):
-            raise UnwantedError
-
-        with pytest.raises(UnwantedError):
-            making._make("small", unwanted)  # and no process is left
-        assert not making._one_arm.locked()
 
     def test_arms_are_made_one_at_a_time_and_who_waits_may_leave(self, descriptions):
         said = []

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pages import frame_of
+from pages import Page, frame_of
 from scenes import avoiding, changed
 
 from dt_viz.baselines.base import NotFittedError
@@ -19,13 +19,13 @@ from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.paper_scenes import FIG_6_PLACES
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.tasks import TASKS, TaskEntry, drawing_task
-from dt_viz.session.comparison import NEXT, OTHERS, WAITS, curves, scored
+from dt_viz.session.comparison import OTHERS, WAITS, curves, scored
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Stage
 from dt_viz.ui.bindings import Bindings
-from dt_viz.ui.scene.comparison import APART, COLOURS, ComparedMotions, TheirArm
+from dt_viz.ui.scene.comparison import APART, COLOURS, ComparedMotions
 from dt_viz.ui.scene.picture import Look
-from dt_viz.ui.tabs.compare import ComparePanel, _compare, _with_their_arm, hint, table_html
+from dt_viz.ui.tabs.compare import ComparePanel, hint, table_html
 
 LIVE, SLOW = "linear", "mpnet"
 
@@ -71,34 +71,6 @@ def test_quick_methods_follow_a_drag_and_slow_ones_come_one_after_the_other(besi
     assert all(len(compared.paths) == 7 and compared.scores.arm_depth is not None for compared in last.values())
     told = [sum(c.scores is not None and c.scores.arm_depth is not None for c in frame.comparison) for frame in frames]
     assert told == sorted(told) and told[3] == 0 and set(told) == {0, 1, 2, 3}
-
-
-@pytest.mark.long
-@pytest.mark.usefixtures("quick")
-def test_while_slow_methods_are_planned_the_frames_say_which_and_how_many_are_left(new_engine, initial, monkeypatch):
-    engine, first, second = new_engine(), "eflow-repulsive", SLOW
-    monkeypatch.setitem(vars(METHODS["eflow-repulsive"]), "live", False)
-    planned = type(engine.comparison)._planned
-    begun = []
-
-    def noted(self, method, *args):
-        begun.append(method.name)
-        return planned(self, method, *args)
-
-    monkeypatch.setattr(type(engine.comparison), "_planned", noted)
-    said = []
-    for frame in engine.frames(shown(initial("push_box"), first, second, LIVE)):
-        found = by_name(frame)
-        if found:
-            assert not found[LIVE].note
-            said.append((found[first].note, found[second].note, tuple(begun)))
-    expected = [
-        (WAITS, WAITS, (LIVE,)),  # while it may be dragged on
-        ("planning … (1 of 2)", NEXT, (LIVE,)),  # said before it begins
-        ("", "planning … (2 of 2)", (LIVE, first)),
-        ("", "", (LIVE, first, second)),
-    ]
-    assert list(dict.fromkeys(said)) == expected
 
 
 @pytest.mark.usefixtures("quick")
@@ -157,12 +129,6 @@ def test_what_an_edit_leaves_unchanged_is_not_planned_again(beside, monkeypatch)
     assert list(by_name(frame)) == ["ours", SLOW]
 
 
-def test_nothing_is_compared_unless_it_is_asked_for(engine, initial):
-    assert [frame.comparison for frame in engine.frames(initial("push_box"))] == [()] * len(Stage)
-    frames = list(engine.frames(shown(initial("push_box"), "no such method")))
-    assert [frame.comparison for frame in frames] == [()] * len(Stage)
-
-
 def test_without_a_motion_of_ours_the_others_are_shown_all_the_same(engine):
     base = Sphere((0.0, 0.0, 0.2), 0.4)
     *_, frame = engine.frames(shown(changed(Scenario("push_box"), obstacles=(base,), space="cspace"), LIVE))
@@ -197,17 +163,17 @@ def test_a_method_that_cannot_plan_says_why(new_engine, initial, monkeypatch, wh
     assert found[LIVE].scores.arm_depth is not None
 
 
-def test_of_a_single_demonstration_by_the_user_what_can_be_fitted_is_and_the_rest_says_why_not(fits, robot):
+def test_of_a_single_demonstration_by_the_user_what_can_be_fitted_is_and_the_rest_is_left_out(fits, robot):
     (demonstration, *_) = TASKS["draw_j"]().demonstrations
     own = TaskEntry("Mine", lambda: drawing_task("mine", "Mine", "", (demonstration,)))
     engine = Engine({"mine": own}, fits, robot)
     *_, frame = engine.frames(shown(avoiding("mine"), "eflow", "eflow-repulsive", "mpnet", LIVE, "modulation"))
     found = by_name(frame)
-    for name in ("ours", LIVE, "modulation"):
-        assert len(found[name].paths) == 1 and not found[name].note
-    for name, trained in (("eflow", "eflow"), ("eflow-repulsive", "eflow"), ("mpnet", "mpnet")):
-        assert not found[name].paths and found[name].scores is None
-        assert f"{trained} has not been trained for 'Mine'" in found[name].note
+    assert list(found) == ["ours", LIVE, "modulation"]
+    for compared in found.values():
+        assert len(compared.paths) == 1 and not compared.note
+    *_, frame = engine.frames(shown(avoiding("mine"), "eflow", "mpnet-rrt"))
+    assert frame.comparison == ()
 
 
 @pytest.mark.long
@@ -248,13 +214,34 @@ def test_the_table_tells_promises_and_marks_what_collides(beside):
     assert "–" in table_html(frames[1].comparison)  # not known yet
 
 
-def test_methods_are_chosen_in_the_order_of_the_tables_and_their_arm_with_them():
-    scenario = Scenario("push_box", view=View(compared=("linear",)))
-    assert _compare("eflow", scenario, True)["view"].compared == ("eflow", "linear")
-    theirs = replace(scenario, **_with_their_arm(scenario, "modulation"))
-    assert theirs.view.compared == ("linear", "modulation") and theirs.view.their_arm == "modulation"
-    assert replace(theirs, **_compare("modulation", theirs, False)).view.their_arm == ""
-    assert replace(theirs, **_compare("linear", theirs, False)).view.their_arm == "modulation"
+@pytest.fixture
+def page(server, robot):
+    page = Page(server, robot)
+    yield page
+    page.close()
+    server.gui.reset()
+    server.scene.reset()
+
+
+@pytest.mark.usefixtures("quick")
+def test_methods_are_ticked_in_the_order_of_the_tables_and_their_arm_with_them(page, beside):
+    engine, scenario, _ = beside
+    for label, value, compared, theirs in (
+        ("Linear", True, ("linear",), ""),
+        ("EFlow", True, ("eflow", "linear"), ""),
+        ("EFlow", False, ("linear",), ""),
+        ("Their arm", "Modulation", ("linear", "modulation"), "modulation"),
+        ("Linear", False, ("modulation",), "modulation"),
+        ("Modulation", False, (), ""),
+        ("Their arm", "MPNet", ("mpnet",), "mpnet"),
+    ):
+        page.claim(page[label], value)
+        assert (page.session.scenario.view.compared, page.session.scenario.view.their_arm) == (compared, theirs)
+    drawn = page.visitor.robot
+    assert not drawn.their_arm.node.visible
+    *_, frame = engine.frames(shown(scenario, SLOW, their_arm=SLOW))
+    drawn.draw(frame, Look())
+    assert drawn.their_arm.node.visible
 
 
 def test_what_is_not_installed_is_grey_with_the_command(server, monkeypatch):
@@ -264,6 +251,25 @@ def test_what_is_not_installed_is_grey_with_the_command(server, monkeypatch):
     boxes = {box.label: box for box in server.gui._gui_input_handle_from_uuid.values() if hasattr(box, "label")}
     assert boxes["MPNet-RRT"].disabled and not boxes["Modulation"].disabled
     assert 'pip install "dt-viz[baselines]"' in hint(METHODS["mpnet-rrt"])
+    server.gui.reset()
+
+
+def test_methods_that_are_trained_in_advance_are_off_for_tasks_of_the_users_own(server, monkeypatch):
+    monkeypatch.setattr("dt_viz.baselines.base.find_spec", lambda _module: True)
+    bound, trained = Bindings(), {method.title for method in OTHERS if method.weights}
+    note = ComparePanel(server.gui, bound, lambda _suffix, _content: None).note
+    handles = list(server.gui._gui_input_handle_from_uuid.values())
+    boxes = {box.label: box for box in handles if getattr(box, "label", "") in {method.title for method in OTHERS}}
+    (their_arm,) = (handle for handle in handles if getattr(handle, "label", "") == "Their arm")
+    view = View(compared=("eflow", "linear"), their_arm="eflow")
+    for task, others in (("draw_s", set()), ("own_data_1", trained), ("draw_s", set())):
+        bound.adopt(Scenario(task, view=view))
+        assert {title for title, box in boxes.items() if box.disabled} == others
+        assert {title for title, box in boxes.items() if box.value} == {"EFlow", "Linear"} - others
+        assert not others & set(their_arm.options) and len(their_arm.options) == 1 + len(boxes) - len(others)
+        assert their_arm.value == ("–" if others else "EFlow")
+        assert note.visible == bool(others)
+    assert "only for the shipped tasks" in note.content and all(title in note.content for title in trained)
     server.gui.reset()
 
 
@@ -301,20 +307,3 @@ def test_motions_are_drawn_in_colours_of_their_own_with_names_apart(scene, besid
     assert np.linalg.norm(apart) > 0.8 * APART
     picture.draw(frame_of(scenario, rollouts=frames[-1].rollouts, goal=frames[-1].goal), Look())
     assert not any(motions.node.visible for motions in picture.motions.values())
-
-
-@pytest.mark.usefixtures("quick")
-def test_their_arm_is_hidden_until_their_motion_is_known(scene, robot, beside):
-    engine, scenario, _ = beside
-    arm = TheirArm(scene, robot)
-    wanted = shown(scenario, SLOW, their_arm=SLOW)
-    moved = changed(wanted, obstacles=(Sphere((0.0, -0.55, 0.2), 0.12),))
-    for frame in engine.frames(moved):
-        arm.draw(frame)
-        arm.show(True)
-        if frame.stage is Stage.LIVE:
-            assert not arm._ghost.visible
-    assert arm._ghost.visible
-    arm.pose(0.0, robot.home, 1.0, sets_out=False)
-    arm.show(False)
-    assert not arm._ghost.visible

@@ -16,10 +16,3 @@ def test_a_scenario_gives_the_rollouts_that_it_gave(robot, number):
         assert {name for name in before.files if name.startswith(f"{number}/")} == {f"{number}/{n}" for n in found}
         for name, path in found.items():
             np.testing.assert_allclose(path, before[f"{number}/{name}"], rtol=0, atol=TOLERANCE, err_msg=name)
-
-
-def test_frozen_scenarios_cover_what_a_stack_can_be():
-    chosen = DESCRIPTIONS.values()
-    assert {description["avoid"]["space"] for description in chosen} == {"task", "cspace"}
-    assert all(any(description[part] for description in chosen) for part in ("biases", "starts", "obstacles"))
-    assert any(description["warp"] < 1 for description in chosen)

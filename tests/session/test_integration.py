@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from scenes import avoiding, biases, changed, random_scenario
 
-from dt_viz.avoidance.placement import bias_beside
-from dt_viz.avoidance.registry import AVOIDANCE
+from dt_viz.avoidance.registry import AVOIDANCE, bias_beside
 from dt_viz.flows.diffeomorphisms import AUTO, Chain, Conjugated, Flow, Integration
 from dt_viz.flows.fields import GaussianGrid, GridRBF
 from dt_viz.flows.integrators import EULER, RK4

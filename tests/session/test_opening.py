@@ -9,6 +9,8 @@ from other_arms import five_joints
 from scipy.spatial.transform import Rotation
 
 import dt_viz as dt
+from dt_viz.avoidance.bias import BiasPoint
+from dt_viz.errors import DataError
 from dt_viz.files.recordings import Recordings
 from dt_viz.files.takes import Take
 from dt_viz.flows.rotations import quaternions
@@ -17,7 +19,7 @@ from dt_viz.learning.demonstrations import Demonstration, DemonstrationError
 from dt_viz.learning.preparation import prepare
 from dt_viz.learning.store import FitStore
 from dt_viz.motion.nominal import Learned
-from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.tasks import TASKS, own_task
 from dt_viz.session.engine import MOST_OWN, NOT_TURNED, Engine
 from dt_viz.session.frame import Stage
@@ -83,14 +85,6 @@ def test_what_is_seen_is_what_is_learned_from(robot, choices):
     np.testing.assert_array_equal(seen.takes[5].given, six(far).takes[5].positions)  # of space: where it is
 
 
-def test_a_switch_changes_what_is_learned(robot):
-    recordings = six()
-    pause = replace(Choices(), preparation=replace(Choices().preparation, cut_pauses=False))
-    cut, kept = (preview(recordings, choices, robot).takes[1] for choices in (Choices(), pause))
-    assert cut.learned is not None and kept.learned is not None and len(kept.learned) > len(cut.learned) + 50
-    assert [finding.kind for finding in kept.inspection.findings] == [f.kind for f in cut.inspection.findings]
-
-
 def test_the_recordings_stay_as_they_are_whatever_is_chosen(robot):
     recordings = Recordings((take("a", 1e3 * motion()), take("b", 1e3 * motion())))
     with pytest.raises(DemonstrationError, match="is the file in millimetres"):
@@ -144,33 +138,6 @@ def test_takes_that_cannot_be_used_are_named_and_the_others_are_used(robot):
         preview(Recordings(tuple(bad[:3])), Choices(), robot)
 
 
-def test_joint_angles_are_turned_into_motions_of_the_hand(robot):
-    q = np.linspace(robot.home, robot.home + 0.3, 50)
-    seen = preview(Recordings((take("q", joints=q),)), Choices(), robot)
-    np.testing.assert_allclose(seen.takes[0].given, robot.end_effector(q))
-
-
-def test_of_several_goals_one_is_chosen_and_it_is_said_which(robot):
-    ends = GOAL, GOAL + np.array([0.0, 0.0, 0.3])
-    recordings = Recordings(tuple(take(f"{k}", motion(goal=ends[k % 2])) for k in range(4)))
-    for goal, end in enumerate(ends):
-        seen = preview(recordings, Choices(goal=goal), robot)
-        assert (
-            seen.goal_number == goal
-            and len(seen.goals) == 2
-            and seen.task is not None
-            and "'0', '2' at" in seen.goals[0]
-        )
-        np.testing.assert_array_equal(seen.goal, end)
-        assert [one.learned is not None for one in seen.takes] == [k % 2 == goal for k in range(4)]
-    assert preview(recordings, Choices(goal=9), robot).task is not None
-
-
-def test_where_all_is_left_out_nothing_can_be_learned(robot):
-    seen = preview(Recordings((take("a", motion()),)), Choices(left_out=frozenset([0])), robot)
-    assert seen.task is None and "Every take is left out" in seen.problem and seen.takes[0].learned is None
-
-
 def test_what_is_out_of_reach_is_said_with_the_scale_that_fits_and_scaled_if_wanted(robot):
     recordings = Recordings((take("near", motion()), take("far", motion((-1.3, -0.6, 0.2)))))
     seen = with_reach(preview(recordings, Choices(), robot), Choices(), robot)
@@ -206,7 +173,7 @@ def own(robot, bend=0.1):
 def test_a_visitors_own_task_is_learned_for_that_visitor_alone(robot, fits):
     stored = dict(fits._memory)
     one, other = (Engine(TASKS, fits, robot) for _ in range(2))
-    first, second = (engine.bring(own(robot, bend), "draw_s")[0] for engine, bend in ((one, 0.1), (other, -0.02)))
+    first, second = (engine.bring(own(robot, bend))[0] for engine, bend in ((one, 0.1), (other, -0.02)))
     assert first.name == second.name and first.title == "Your data"
     frames = [list(engine.frames(Scenario(first.name, stack=()))) for engine in (one, other)]
     ends = [each[-1] for each in frames]
@@ -225,23 +192,40 @@ def test_an_own_task_is_learned_as_it_was_seen_and_what_was_seen_is_no_warning(r
     seen = preview(six(), replace(Choices(), preparation=kept), robot)
     assert seen.task is not None
     engine = Engine(TASKS, FitStore(None), robot)
-    *_, frame = engine.frames(Scenario(engine.bring(seen.task, "draw_s")[0].name, stack=()))
+    *_, frame = engine.frames(Scenario(engine.bring(seen.task)[0].name, stack=()))
     told = frame.motion.nominal.imitation.warnings
     assert any("jitters" in text and "smoothed" not in text for text in told)
     assert set(seen.task.seen) <= set(told)
     assert not {str(warning) for warning in frame.certificates.warnings} & set(seen.task.seen)
 
 
-def test_own_tasks_are_few_and_the_one_that_is_shown_stays(robot):
+def test_own_tasks_stay_and_one_too_many_is_refused_unless_another_was_deleted(robot):
     engine = Engine(TASKS, FitStore(None), robot)
-    task, names, gone = own(robot), [], []
-    for _ in range(MOST_OWN + 2):
-        brought, oldest = engine.bring(task, names[0] if names else "draw_s")
-        names.append(brought.name)
-        gone.append(oldest)
-    assert len(set(names)) == len(names) and len(engine.own) == MOST_OWN
-    assert gone == [None] * MOST_OWN + names[1:3] and names[0] in engine.own
-    assert engine.task(names[-1]).title == f"Your data {MOST_OWN + 2}"
+    tasks = [own(robot).placed(1.0, (0.01 * k, 0.0, 0.0)) for k in range(MOST_OWN + 2)]
+    names = [engine.bring(task)[0].name for task in tasks[:MOST_OWN]]
+    assert len(set(names)) == len(names) == MOST_OWN
+    with pytest.raises(DataError, match="delete one first"):
+        engine.bring(tasks[-2])
+    assert [*engine.own] == names
+    brought, gone = engine.bring(tasks[-2], deleted=names[1:3])
+    assert gone == names[1] and [*engine.own] == [names[0], *names[2:], brought.name]
+    assert brought.title == f"Your data {MOST_OWN + 1}"
+    last, gone = engine.bring(tasks[-1], number=2, deleted=names[1:3])  # which another one had
+    assert gone == names[2] and last.title == f"Your data {MOST_OWN + 2}"
+
+
+def test_an_own_task_that_comes_again_is_the_one_that_is_there(robot):
+    engine, ball = Engine(TASKS, FitStore(None), robot), (Layer(BiasPoint((0.1, -0.4, 0.3)), name="Bias point 1"),)
+    first, _ = engine.bring(own(robot))
+    assert engine.bring(own(robot)) == (first, None) and first is engine.task(first.name)
+    others = [
+        engine.bring(own(robot), "panda")[0],
+        engine.bring(own(robot, 0.11))[0],
+        engine.bring(own(robot).placed(1.0, (0.0, 0.0, 0.01)))[0],
+        engine.bring(replace(own(robot), layers=ball))[0],
+        engine.bring(replace(own(robot), state="augmented"), number=9)[0],
+    ]
+    assert [other.name for other in others] == [f"own_data_{k}" for k in (2, 3, 4, 5, 9)]
 
 
 def test_undo_forgets_a_task_that_is_gone():
@@ -249,7 +233,8 @@ def test_undo_forgets_a_task_that_is_gone():
     for before, after in pairwise(scenarios):
         history.edited(after.task, before, after)
     history.forget("own_data_1")
-    assert history.undone(scenarios[-1]) == scenarios[0] and history.undone(scenarios[0]) is None
+    step = history.undone(scenarios[-1])
+    assert step is not None and step.scenario == scenarios[0] and history.undone(scenarios[0]) is None
 
 
 def test_places_are_followed_where_the_arm_cannot_turn_its_hand_as_demonstrated(robot):
@@ -266,7 +251,7 @@ def test_places_are_followed_where_the_arm_cannot_turn_its_hand_as_demonstrated(
         turns = quaternions(Rotation.from_rotvec(rng.normal(0, 2, 3)) * by)
         starts = begin + 0.02 * rng.normal(size=(3, 3))
         takes = [Demonstration(4 * along[:, 0], start + along * (end - start), "take", turns) for start in starts]
-        own, _ = engine.bring(own_task(tuple(takes)), "draw_s")
+        own, _ = engine.bring(own_task(tuple(takes)))
         learned = engine.nominal(Scenario(own.name)).learned
         turned = Learned.of(own, fit_augmented(takes), imitates=True)
         assert turned.poses is not None

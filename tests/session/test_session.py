@@ -14,7 +14,6 @@ from scenes import avoiding, biases, changed, changing
 from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.avoidance.passing import ANEW, Passing
 from dt_viz.avoidance.registry import AVOIDANCE
-from dt_viz.checkpoints import checkpoint
 from dt_viz.errors import end_if
 from dt_viz.learning.demonstrations import DemonstrationError
 from dt_viz.learning.imitation import ImitationError
@@ -25,7 +24,6 @@ from dt_viz.scenario.slices import SlicePose
 from dt_viz.scenario.stack import IMITATION, with_added, without
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session import session as session_module
-from dt_viz.session.cores import CORES
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Stage
 from dt_viz.session.history import GESTURE_PAUSE, MAX_UNDO, Beside
@@ -102,14 +100,13 @@ class Page:
     """A display that remembers."""
 
     def __init__(self):
-        self.frames, self.paces, self.times, self.adopted = [], [], [], []
+        self.frames, self.paces, self.adopted = [], [], []
         self.errors, self.warnings = [], []
         self.progress = None
 
     def draw(self, frame, pace):
         self.frames.append(frame)
         self.paces.append(pace)
-        self.times.append(time.perf_counter())
 
     def adopt(self, scenario):
         self.adopted.append(scenario)
@@ -133,7 +130,6 @@ class Opened:
     engine: FakeEngine
     page: Page
     clock: list
-    began: float = 0.0
     before: Scenario | None = None
     scene: Scenario | None = None
 
@@ -263,13 +259,14 @@ def test_an_edit_that_changes_nothing_does_nothing(opened):
     assert opened.session.scenario == fresh("draw_s")
 
 
-@pytest.mark.parametrize("layer", ["ghost", "ghost_arm", "onion", "body_points", "joint_plots"])
-def test_a_view_of_what_is_there_is_adopted_and_nothing_is_computed(opened, layer):
-    asked, other = len(opened.engine.asked), replace(View(), **{layer: not getattr(View(), layer)})
-    opened.edit(layer, view=other)
-    opened.settle()
-    assert opened.page.adopted[-1].view == opened.session.scenario.view == other
-    assert len(opened.engine.asked) == asked
+@pytest.mark.parametrize("layer", ["ghost", "ghost_arm", "onion", "body_points", "joint_plots", "grid"])
+def test_only_a_view_of_what_is_not_there_is_computed_and_all_are_adopted(opened, layer):
+    asked, view = len(opened.engine.asked), replace(View(), **{layer: not getattr(View(), layer)})
+    for other in (view, View(), replace(View(), generator_layer=2)):
+        opened.edit(layer, view=other)
+        opened.settle()
+        assert opened.page.adopted[-1].view == opened.session.scenario.view == other
+        assert len(opened.engine.asked) == asked + (layer == "grid")
 
 
 @pytest.mark.parametrize("held", [False, True], ids=["a slider", "a drag, however slow"])
@@ -347,7 +344,7 @@ def test_what_is_open_beside_the_scenario_is_undone_in_its_place(opened):
     assert session.scenario != before and opened.page.progress.beside is None
 
 
-def test_reset_goes_back_to_the_beginning_and_how_it_was_seen_and_the_motion_can_be_undone(opened):
+def test_reset_goes_back_to_the_beginning_and_how_it_was_seen_and_all_of_it_can_be_undone(opened):
     opened.edit("ghost", view=View(ghost=False, playing=False, health_plots=True))
     opened.edit("a", temperature=2.0, obstacles=(at(1.0),), generator="probability")
     changed = opened.session.scenario
@@ -355,7 +352,9 @@ def test_reset_goes_back_to_the_beginning_and_how_it_was_seen_and_the_motion_can
     opened.settle()
     assert opened.session.scenario == opened.shown == fresh("draw_s")
     opened.session.undo()
-    assert opened.session.scenario == replace(changed, view=View())
+    assert opened.session.scenario == changed
+    opened.session.redo()
+    assert opened.session.scenario == fresh("draw_s")
 
 
 def test_another_task_brings_its_place_and_its_slice_and_keeps_other_choices(opened):
@@ -377,7 +376,7 @@ def test_another_task_brings_its_place_and_its_slice_and_keeps_other_choices(ope
     assert session.scenario == scenario  # the same one changes nothing
 
 
-def test_another_task_begins_with_its_own_obstacle_in_the_shape_of_the_first(opened):
+def test_another_task_begins_with_its_own_obstacle_in_the_shape_of_the_first_and_without_layers(opened):
     box = Box((0.0, 0.0, 0.0), (0.1, 0.2, 0.1), (0.6, 0.8, 0.0, 0.0))
     for obstacles in ((box,), (box, at(1.0), at(2.0))):
         opened.edit("shapes", obstacles=obstacles)
@@ -388,6 +387,14 @@ def test_another_task_begins_with_its_own_obstacle_in_the_shape_of_the_first(ope
     opened.edit("shapes", obstacles=())
     opened.session.choose_task("lift_box")
     assert opened.session.scenario.obstacles == ()
+    opened.session.choose_task("draw_s")
+    opened.session.reset()
+    opened.edit("scene", layers=biases(BiasPoint((0.2, -0.5, 0.4))), level=0, temperature=8.0)
+    opened.session.choose_task("lift_box")
+    assert opened.session.scenario == changed(fresh("lift_box"), temperature=8.0)
+    opened.edit("scene", obstacles=(), space="cspace", scene="somewhere")
+    opened.session.choose_task("draw_s")
+    assert opened.session.scenario == fresh("draw_s")
 
 
 def test_a_task_that_cannot_be_read_is_refused_and_the_session_stays(opened):
@@ -422,7 +429,7 @@ def test_an_error_is_shown_once_and_the_session_goes_on(opened, caplog):
     assert len(opened.page.errors) == 1
 
 
-def test_a_message_stays_until_another_scenario_is_shown(opened):
+def test_a_message_stays_until_another_scenario_is_shown_and_passes_but_for_what_has_failed(opened):
     opened.session.fail(ValueError("it fails"))
     assert opened.page.progress.failed
     opened.session.undo()  # nothing to undo
@@ -432,8 +439,6 @@ def test_a_message_stays_until_another_scenario_is_shown(opened):
     progress = opened.page.progress
     assert progress.message is None and not progress.failed and progress.complete and not progress.stale
 
-
-def test_a_message_passes_but_for_what_has_failed(opened):
     def text(after):
         opened.clock[0] += after
         opened.session.let_pass()
@@ -499,15 +504,6 @@ def test_a_session_that_closes_ends_what_it_computes_for_a_hand(opened, stage):
     assert opened.page.errors == []
 
 
-def test_all_work_of_a_visitor_gives_way_to_others_at_its_checkpoints(monkeypatch, request):
-    paused = []
-    monkeypatch.setattr(CORES, "give_way", lambda: paused.append(threading.current_thread().name))
-    opened = request.getfixturevalue("opened")
-    opened.session.jobs.submit("reading", checkpoint)
-    assert opened.session.jobs.wait_idle(timeout=PATIENCE)
-    assert paused == ["reading"]
-
-
 def test_edits_during_a_computation_are_overtaken_by_the_last(opened):
     opened.engine.begun.clear()
     opened.engine.gate = threading.Event()
@@ -524,45 +520,26 @@ def test_edits_during_a_computation_are_overtaken_by_the_last(opened):
     assert opened.page.paces[-1].num_skipped == 6
 
 
-class TestInTheQueue:
-    """What waits for a slot while others compute."""
-
-    @pytest.fixture
-    def waiting(self, opened):
-        opened.engine.begun.clear()
-        opened.engine.queue, opened.began = threading.Event(), time.perf_counter()
-        opened.edit("obstacle", obstacles=(at(0.0),))
-        assert opened.engine.begun.wait(PATIENCE)
-        return opened
-
-    def test_the_newest_of_a_drag_is_computed_when_its_turn_comes(self, waiting):
-        time.sleep(0.5)  # the latency is that of the newest edit
-        for x in range(1, 8):
-            waiting.edit("obstacle", obstacles=(at(float(x)),))
-        shown = len(waiting.page.frames)
-        waiting.engine.queue.set()
-        waiting.settle()
-        assert [scenario.obstacles[0] for scenario in waiting.engine.asked[1:]] == [at(7.0)]
-        assert [frame.stage for frame in waiting.page.frames[shown:]] == [*Stage]
-        assert {frame.scenario for frame in waiting.page.frames[shown:]} == {waiting.session.scenario}
-        pace = waiting.page.paces[shown]
-        assert pace.num_skipped == 7 and pace.latency < waiting.page.times[shown] - waiting.began - 0.5
-        assert waiting.session.scenario.passing is not None
-
-    @pytest.mark.parametrize("change", [{"task": "draw_j"}, {"view": View(grid=True)}, {"warp": 0.5}])
-    def test_another_choice_than_of_the_stack_waits_for_its_own(self, waiting, change):
-        waiting.session.edit("another", **change)
-        waiting.engine.queue.set()
-        waiting.settle()
-        first, second = waiting.engine.asked[1:]
-        assert first.obstacles == (at(0.0),) and not any(getattr(first, name) == to for name, to in change.items())
-        assert all(getattr(second, name) == to for name, to in change.items())
-
-    def test_a_failure_of_the_newest_is_told_once(self, waiting):
-        waiting.edit("obstacle", temperature=13.0)
-        waiting.engine.queue.set()
-        waiting.settle()
-        assert len(waiting.page.errors) == 1 and waiting.page.progress.failed
+@pytest.mark.parametrize(
+    "change", [{}, {"task": "draw_j"}, {"view": View(grid=True)}, {"warp": 0.5}], ids=["a drag", "task", "view", "warp"]
+)
+def test_the_newest_of_a_drag_is_computed_when_its_turn_comes_and_another_choice_waits_for_its_own(opened, change):
+    opened.engine.begun.clear()
+    opened.engine.queue = threading.Event()
+    opened.edit("obstacle", obstacles=(at(0.0),))
+    assert opened.engine.begun.wait(PATIENCE)
+    for x in () if change else range(1, 8):
+        opened.edit("obstacle", obstacles=(at(float(x)),))
+    if change:
+        opened.session.edit("another", **change)
+    opened.engine.queue.set()
+    opened.settle()
+    asked = opened.engine.asked[1:]
+    assert [scenario.obstacles[0] for scenario in asked] == [at(0.0)] * 2 if change else [at(7.0)]
+    for scenario in asked:
+        wanted = scenario is asked[-1]
+        assert all((getattr(scenario, name) == to) == wanted for name, to in change.items())
+    assert opened.shown == opened.session.scenario and opened.session.scenario.passing is not None
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -592,7 +569,7 @@ def test_after_a_storm_from_several_threads_the_last_picture_is_that_of_the_last
         thread.join(PATIENCE)
     opened.settle()
     assert opened.page.errors == []
-    assert opened.shown == opened.session.scenario
+    assert opened.shown == opened.page.adopted[-1] == opened.session.scenario
     assert opened.page.frames[-1].stage is max(Stage)
     # frames come in the order of their computations, each computation's in the order of its stages; the first stage is
     # left out where the computation before was of the same motion
@@ -658,21 +635,22 @@ def test_cancelling_keeps_the_view_and_forgets_what_was_edited_meanwhile(opened)
     opened.session.cancel()
     opened.settle()
     assert opened.session.scenario == opened.shown == replace(fresh("draw_s"), view=View(ghost=False))
-    opened.session.undo()
-    assert opened.session.scenario.task == "draw_s"
 
 
-@pytest.mark.parametrize("how", ["another task", "undo"])
-def test_another_choice_supersedes_learning(opened, how):
+@pytest.mark.parametrize(
+    ("choose", "task"),
+    [
+        (lambda session: session.choose_task("pots"), "pots"),
+        (lambda session: session.undo(), "draw_s"),
+        (lambda session: session.close(), "draw_s"),
+    ],
+    ids=["another task", "undo", "leaving"],
+)
+def test_another_choice_supersedes_learning_and_leaving_ends_it(opened, choose, task):
     begin_learning(opened)
-    if how == "another task":
-        opened.session.choose_task("pots")
-    else:
-        opened.session.undo()
+    choose(opened.session)
     opened.settle()
-    assert opened.shown == opened.session.scenario
-    assert opened.shown.task == {"another task": "pots", "undo": "draw_s"}[how]
-    assert opened.page.errors == opened.page.warnings == []
+    assert opened.shown.task == task and opened.page.errors == opened.page.warnings == []
 
 
 def test_moving_the_obstacle_does_not_begin_learning_anew(opened):
@@ -705,13 +683,6 @@ def test_the_first_task_can_be_cancelled_too_and_any_edit_begins_again():
         session.close()
 
 
-def test_closing_ends_learning(opened):
-    begin_learning(opened)
-    opened.session.close()
-    opened.settle()
-    assert opened.page.errors == []
-
-
 def test_a_task_that_cannot_be_learned_leaves_the_picture_and_the_choice_before_it(opened, caplog):
     with caplog.at_level(logging.CRITICAL):
         opened.session.choose_task("hopeless")
@@ -720,20 +691,7 @@ def test_a_task_that_cannot_be_learned_leaves_the_picture_and_the_choice_before_
     assert opened.session.scenario == opened.shown == opened.page.adopted[-1] == fresh("draw_s")
 
 
-def test_a_picture_that_is_computed_on_demand_is_asked_for_once_it_is_shown(opened):
-    asked = len(opened.engine.asked)
-    opened.edit("grid", view=View(grid=True))
-    opened.settle()
-    assert opened.shown.view.grid and len(opened.engine.asked) == asked + 1
-    opened.edit("grid", view=View())
-    opened.edit("flow", view=View(generator_layer=2))
-    opened.settle()
-    assert len(opened.engine.asked) == asked + 1
-    opened.session.undo()
-    assert opened.session.scenario == replace(fresh("draw_s"), view=View(generator_layer=2))
-
-
-def test_a_scene_is_seen_as_it_wants_to_be_and_undo_brings_back_what_was_seen_before(in_scene):
+def test_a_scene_is_seen_as_it_wants_undo_brings_back_what_was_seen_before_and_reset_the_scene(in_scene):
     session, scene = in_scene.session, in_scene.scene
     in_scene.settle()
     assert in_scene.shown == replace(scene, view=replace(scene.view, speed=2.0))
@@ -741,7 +699,15 @@ def test_a_scene_is_seen_as_it_wants_to_be_and_undo_brings_back_what_was_seen_be
     session.undo()
     assert session.scenario == in_scene.before
     session.redo()
-    assert session.scenario.view == replace(scene.view, speed=2.0)
+    loaded = session.scenario
+    assert loaded.view == replace(scene.view, speed=2.0)
+    in_scene.edit("size", obstacles=(at(1.0),), temperature=2.0)
+    session.edit("view", view=View(grid=True))
+    edited = session.scenario
+    session.reset()
+    assert session.scenario == replace(loaded, view=replace(loaded.view, speed=1.0))
+    session.undo()
+    assert session.scenario.choices == edited.choices
 
 
 @pytest.mark.parametrize("leave", ["leave_scene", "choose_task"])
@@ -756,17 +722,6 @@ def test_a_scene_that_is_left_leaves_nothing_of_what_it_shows(in_scene, leave):
         assert session.scenario == replace(left, view=replace(left.view, speed=2.0))
     session.undo()
     assert session.scenario.view.colour == "occupancy"
-
-
-def test_reset_in_a_scene_brings_the_scene_back_as_it_was(in_scene):
-    session, loaded = in_scene.session, in_scene.session.scenario
-    in_scene.edit("size", obstacles=(at(1.0),), temperature=2.0)
-    session.edit("view", view=View(grid=True))
-    edited = session.scenario
-    session.reset()
-    assert session.scenario == replace(loaded, view=replace(loaded.view, speed=1.0))
-    session.undo()
-    assert session.scenario.choices == edited.choices
 
 
 def test_moving_the_slice_is_a_step_for_undo(opened):
@@ -789,16 +744,6 @@ def test_moving_the_slice_is_a_step_for_undo(opened):
     assert session.scenario.view.slice == poses[2]
     session.reset()
     assert session.scenario.view.slice is None and not session.scenario.view.grid
-
-
-def test_another_task_begins_without_the_layers_of_this_one_and_after_a_scene_with_its_own_obstacle(opened):
-    session = opened.session
-    opened.edit("scene", layers=biases(BiasPoint((0.2, -0.5, 0.4))), level=0, temperature=8.0)
-    session.choose_task("lift_box")
-    assert session.scenario == changed(fresh("lift_box"), temperature=8.0)
-    opened.edit("scene", obstacles=(), space="cspace", scene="somewhere")
-    session.choose_task("draw_s")
-    assert session.scenario == fresh("draw_s")
 
 
 # --- Levels of the stack ---

@@ -1,60 +1,52 @@
 """Who gets in, and what gets in: real handshakes and messages, against the server that the demo starts."""
 
 import asyncio
-import functools
-import logging
+import contextlib
+import itertools
 import os
+import re
 import socket
 import sys
 import threading
 import time
 import urllib.error
 import urllib.request
-from contextlib import AsyncExitStack, asynccontextmanager, closing, contextmanager
+from concurrent.futures import Future
+from contextlib import AsyncExitStack, asynccontextmanager, closing
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import get_type_hints
+from typing import Any, cast
 
 import msgspec
 import numpy as np
 import pytest
 import viser  # noqa: TID251 - whose version the page has
 import websockets.sync.client
-from pages import wait_until
+from pages import asynchronous, come_true, wait_until
+from protocol_client import OBSTACLE, ROLLOUT, LostError, ProtocolClient
 from viser._messages import ResetGuiMessage  # noqa: TID251
 from viser.infra._async_message_buffer import AsyncMessageBuffer  # noqa: TID251
 from websockets.asyncio.client import connect
 from websockets.typing import Subprotocol
 
-from dt_viz.evaluate.protocol_client import OBSTACLE, ROLLOUT, LostError, ProtocolClient
 from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.tasks import TASKS
-from dt_viz.serving.board import Board, Share
-from dt_viz.serving.listening import listen
-from dt_viz.session.cores import Cores, CoresSettings, Rank
+from dt_viz.serving.board import Share
+from dt_viz.serving.supervisor import listen
 from dt_viz.session.progress import Pace
-from dt_viz.ui import gate, keeping
+from dt_viz.ui import gate
 from dt_viz.ui import server as server_module
-from dt_viz.ui import visitor as visitor_module
-from dt_viz.ui.keeping import ATTEMPTS, KEY
-from dt_viz.ui.origins import Origin
-from dt_viz.ui.panel import MAX_UPLOAD
+from dt_viz.ui.keeping import KEY
 from dt_viz.ui.patches import GateError, connection_of
-from dt_viz.ui.scripts import Ruler, told
 from dt_viz.ui.server import Server
 
-PATIENCE = 90.0
-"""Seconds that anything may take: the machine may be busy."""
+PATIENCE = 90.0  # seconds that anything may take: the machine may be busy
 UPLOAD = "Mesh or point cloud"
 NUM_PLACES, MAX_WAITING = 2, 8
 
 
 class Client(ProtocolClient):
     """A visitor who may be sent away."""
-
-    async def __aenter__(self):
-        await super().__aenter__()
-        return self
 
     async def is_lost(self) -> bool:
         """Whether the server closes the connection."""
@@ -66,7 +58,7 @@ class Client(ProtocolClient):
 
 @pytest.fixture(scope="module")
 def server(fits):
-    allowed = [Origin.parse("https://demo.example.org")]
+    allowed = [gate.origin_of("https://demo.example.org")]
     places, waiting = NUM_PLACES, MAX_WAITING
     server = Server(
         TASKS, fits, load_jaco(), task="draw_s", port=0, max_sessions=places, max_waiting=waiting, allowed=allowed
@@ -82,27 +74,18 @@ def url(server):
     return f"ws://127.0.0.1:{server.port}"
 
 
-def asynchronous(test):
-    """Runs a test on an event loop, for so long."""
-
-    @functools.wraps(test)
-    def run(**fixtures):
-        asyncio.run(asyncio.wait_for(test(**fixtures), 2 * PATIENCE))
-
-    return run
-
-
-async def come_true(condition):
-    await asyncio.to_thread(wait_until, condition, PATIENCE)
-
-
 @asynccontextmanager
 async def visiting(url):
     """A visitor who has the first picture."""
     async with Client(url) as client:
-        await client.look()
-        assert await client.wait_for(lambda: client.has_picture, PATIENCE)
+        assert await client.look_until_drawn(PATIENCE)
         yield client
+
+
+async def only_visitor(server):
+    await come_true(lambda: server.visitors)  # the first picture may be there before the page is built
+    (visitor,) = server.visitors
+    return visitor
 
 
 def grow_idle(server, seconds):
@@ -136,26 +119,23 @@ async def status_of(url, **options):
 
 
 @pytest.mark.parametrize(
-    ("origin", "status"),
-    [(None, 101), ("http://127.0.0.1:{port}", 101), ("https://demo.example.org", 101), ("https://evil.example", 403)],
+    ("host", "origins", "status"),
+    [
+        ("127.0.0.1", [], 101),
+        ("127.0.0.1", ["http://127.0.0.1:{port}"], 101),
+        ("127.0.0.1", ["https://demo.example.org"], 101),
+        ("127.0.0.1", ["https://evil.example"], 403),
+        ("127.0.0.1", 2 * ["http://127.0.0.1:{port}"], 403),
+        ("evil.example", ["http://evil.example:{port}"], 421),  # a name that was made to resolve to the server
+    ],
 )
 @asynchronous
-async def test_programs_the_own_page_and_allowed_ones_may_connect_and_others_may_not(url, server, origin, status):
-    assert await status_of(url, origin=origin and origin.format(port=server.port)) == status
-
-
-@asynchronous
-async def test_two_origins_are_one_too_many(url, server):
-    own = f"http://127.0.0.1:{server.port}"
-    assert await status_of(url, origin=own, additional_headers={"Origin": own}) == 403
-
-
-@asynchronous
-async def test_a_name_that_was_made_to_resolve_to_the_server_is_refused(server):
-    """The browser connects to 127.0.0.1, and the page is from what it takes for the same server."""
-    name = f"evil.example:{server.port}"
+async def test_programs_the_own_page_and_allowed_ones_may_connect_and_others_may_not(
+    url, server, host, origins, status
+):
+    headers = [("Origin", origin.format(port=server.port)) for origin in origins]
     sock = socket.create_connection(("127.0.0.1", server.port))
-    assert await status_of(f"ws://{name}", sock=sock, origin=f"http://{name}") == 421
+    assert await status_of(f"ws://{host}:{server.port}", sock=sock, additional_headers=headers) == status
 
 
 def test_the_page_is_not_given_out_under_such_a_name_either(url, server):
@@ -185,28 +165,26 @@ def told_to_prometheus(server, host="127.0.0.1"):
 @asynchronous
 async def test_prometheus_is_told_what_visitors_do_and_nobody_is_under_a_foreign_name(url, server):
     pytest.importorskip("prometheus_client")
-    assert (await asyncio.to_thread(told_to_prometheus, server, "evil.example"))[0] == 421
-    status, at_first = await asyncio.to_thread(told_to_prometheus, server)
+    told = lambda *host: asyncio.to_thread(told_to_prometheus, server, *host)  # noqa: E731
+    assert (await told("evil.example"))[0] == 421
     async with visiting(url) as client:
-        (visitor,) = server.visitors
+        visitor = await only_visitor(server)
         assert await asyncio.to_thread(visitor.session.wait_idle, PATIENCE)
-        _, before = await asyncio.to_thread(told_to_prometheus, server)
-        num_edits = visitor.session._edits.number
-        await client.grab()
-        for k in range(5):
-            shown = client.nodes[ROLLOUT]["vertices"]
-            await client.move((0.1, -0.5, 0.345 + 0.01 * k))
-            assert await client.wait_for(lambda shown=shown: client.nodes[ROLLOUT]["vertices"] is not shown, PATIENCE)
-        await client.release()
-        assert await answers(client)
+        (_, before), num_edits, shown = (
+            await told(),
+            visitor.session._screen.num_edits,
+            client.nodes[ROLLOUT]["vertices"],
+        )
+        await client.set("Warp", 0.5)
+        assert await client.wait_for(lambda: client.nodes[ROLLOUT]["vertices"] is not shown, PATIENCE)
         assert await asyncio.to_thread(visitor.session.wait_idle, PATIENCE)
-        _, after = await asyncio.to_thread(told_to_prometheus, server)
+        status, after = await told()
     assert await status_of(url, origin="https://evil.example") == 403
-    _, refused = await asyncio.to_thread(told_to_prometheus, server)
-    assert status == 200 and at_first["dt_viz_visitors"] == 0 and after["dt_viz_visitors"] == 1
+    await come_true(lambda: not server.visitors)
+    _, refused = await told()
+    assert status == 200 and after["dt_viz_visitors"] == 1 and refused["dt_viz_visitors"] == 0
     grown = {name: after[f"dt_viz_{name}"] - before[f"dt_viz_{name}"] for name in ("edits_total", "frames_total")}
-    assert 5 <= grown["edits_total"] == visitor.session._edits.number - num_edits
-    assert 2 <= grown["frames_total"] <= grown["edits_total"]
+    assert 1 <= grown["frames_total"] <= grown["edits_total"] == visitor.session._screen.num_edits - num_edits
     assert after["dt_viz_latency_seconds_sum"] > before["dt_viz_latency_seconds_sum"]
     assert refused["dt_viz_refused_requests_total"] == after["dt_viz_refused_requests_total"] + 1
 
@@ -236,8 +214,8 @@ async def test_there_are_only_so_many_connections(url, server):
 @asynchronous
 async def test_no_address_takes_all_of_them(url, server, monkeypatch):
     """A proxy on this machine says who has connected to it; of IPv6 a network is one."""
-    assert server.gate.limits.of_address == (NUM_PLACES + MAX_WAITING) // 2
-    monkeypatch.setattr(server.gate, "limits", replace(server.gate.limits, of_address=2))
+    assert server.gate.of_address == (NUM_PLACES + MAX_WAITING) // 2
+    monkeypatch.setattr(server.gate, "of_address", 2)
     networks = [["203.0.113.7", "8.8.8.8, 203.0.113.7", "203.0.113.7"], ["2001:db8::1", "2001:db8::2", "2001:db8::3"]]
     async with AsyncExitStack() as stack:
         for addresses in networks:
@@ -249,23 +227,6 @@ async def test_no_address_takes_all_of_them(url, server, monkeypatch):
             assert await status_of(url, additional_headers=headers[2]) == 429
         assert await status_of(url, additional_headers={"X-Forwarded-For": "203.0.113.8"}) == 101
         assert await status_of(url) == 101
-
-
-@asynchronous
-async def test_visitors_of_one_address_owe_what_any_of_them_uses(url, server):
-    async with AsyncExitStack() as stack:
-        for _ in range(NUM_PLACES):
-            client, headers = Client(url), {"X-Forwarded-For": "203.0.113.7"}
-            client._connect = functools.partial(client._connect, additional_headers=headers)
-            await (await stack.enter_async_context(client)).look()
-        await come_true(lambda: len(server.visitors) == NUM_PLACES)
-        one, other = (visitor.session.jobs._account for visitor in server.visitors)
-        one.charge(1000.0)
-        assert one.debt > other.debt > 1
-    await come_true(lambda: not server.visitors)
-    async with visiting(url):
-        (visitor,) = server.visitors
-        assert not visitor.session.jobs._account.debt
 
 
 @asynchronous
@@ -296,30 +257,13 @@ async def test_who_waits_is_told_so_and_has_the_next_place_that_is_free(url, ser
         assert not waits(first) and waits(last) and len(server.visitors) == NUM_PLACES
 
 
-@asynchronous
-async def test_nobody_waits_for_who_came_before_to_another_process_while_both_have_a_place(url, server, monkeypatch):
-    """Nobody attends to those who wait: they would have a place at last, one every half second."""
-    board = Board(2, NUM_PLACES + MAX_WAITING)
-    here, elsewhere = Share(board, 0), Share(board, 1)
-    elsewhere.seat(0, [0.0])
-    monkeypatch.setattr(server, "_share", here)
-    async with visiting(url), Client(url) as waiting:
-        await waiting.look()
-        assert await waiting.wait_for(lambda: here.num_waiting == 2, PATIENCE)
-        assert not await waiting.wait_for(lambda: waiting.has_picture, 0.5)
-        elsewhere.seat(0, [])
-        await asyncio.to_thread(server.attend)
-        assert await waiting.wait_for(lambda: waiting.has_picture, PATIENCE)
-
-
 @pytest.mark.long
 @asynchronous
 async def test_who_does_nothing_gives_his_place_to_one_who_waits_and_only_then(url, server):
     async with AsyncExitStack() as stack:
         idle, busy, waiting = [Client(url) for _ in range(NUM_PLACES + 1)]
         for client in (idle, busy):
-            await (await stack.enter_async_context(client)).look()
-            assert await client.wait_for(lambda c=client: c.has_picture, PATIENCE)
+            assert await (await stack.enter_async_context(client)).look_until_drawn(PATIENCE)
         await come_true(lambda: len(server.visitors) == NUM_PLACES)
         grow_idle(server, 2 * server_module.IDLE)
         server.attend()
@@ -351,90 +295,23 @@ async def test_the_arm_of_a_page_that_nobody_touches_rests_and_soon_where_many_a
     url, server, monkeypatch, num_cores, seconds, expected
 ):
     monkeypatch.setattr(server_module.os, "cpu_count", lambda: num_cores)
-    async with Client(url) as idle, Client(url) as busy:
-        for client in (idle, busy):
-            await client.look()
-            assert await client.wait_for(lambda c=client: c.has_picture, PATIENCE)
-        found = None
-        for _ in range(5):  # a page may still answer by itself, which counts as its visitor's
+
+    def neglected():
+        server.attend()
+        return [visitor.robot.playback.neglected for visitor in server.visitors]
+
+    async with visiting(url) as idle, visiting(url) as busy:
+
+        async def rests():  # a page may still answer by itself, which counts as its visitor's
             grow_idle(server, seconds)
             await busy.look()
             assert await answers(busy)
-            server.attend()
-            if (found := [visitor.robot.playback.neglected for visitor in server.visitors]) == expected:
-                break
-            await asyncio.sleep(0.2)
-        assert found == expected
+            return neglected() == expected
+
+        assert any([await rests() for _ in range(3)])
         await idle.look()
         assert await answers(idle)
-        server.attend()
-        assert not any(visitor.robot.playback.neglected for visitor in server.visitors)
-
-
-@asynchronous
-async def test_the_arm_of_a_page_moves_only_between_hands(url, server, monkeypatch):
-    """Also one that takes another's place."""
-    may_move, between_hands, asked = threading.Event(), Cores.between_hands, []
-    may_move.set()
-
-    @contextmanager
-    def counted(cores):
-        asked.append(True)
-        with between_hands(cores):
-            may_move.wait(PATIENCE)
-            yield
-
-    monkeypatch.setattr(Cores, "between_hands", counted)
-    async with Client(url) as client:
-        await client.look()
-        assert await client.wait_for(lambda: client.has_picture, PATIENCE)
-        (visitor,) = server.visitors
-        for _ in range(2):
-            robot, before = visitor.robot, len(asked)
-            moments = lambda: robot.playback.recording.past.times[-1]  # noqa: B023, E731
-            await asyncio.to_thread(wait_until, lambda: len(asked) > before + 5, PATIENCE)  # noqa: B023
-            await asyncio.to_thread(wait_until, lambda: robot.playback.recording.past is not None, PATIENCE)  # noqa: B023
-            may_move.clear()
-            await asyncio.sleep(0.3)
-            held = moments()
-            await asyncio.sleep(0.5)
-            assert moments() == held
-            may_move.set()
-            await asyncio.to_thread(wait_until, lambda: moments() > held, PATIENCE)  # noqa: B023
-            await asyncio.to_thread(visitor._exchange, "")
-
-
-@asynchronous
-async def test_a_page_is_built_before_anybody_refines_and_after_first_pictures(url, monkeypatch):
-    """While it asks the browser, no slot is taken: others need it, and a browser may not answer at all."""
-    cores, asked, taken = Cores(2, CoresSettings(patience=10 * PATIENCE)), [], []
-    slot = cores.slot
-    monkeypatch.setattr(visitor_module, "CORES", cores)
-    monkeypatch.setattr(cores, "slot", lambda rank=Rank.HAND, *more: (taken.append(rank), slot(rank, *more))[1])
-    ask = keeping.Keeper._ask
-    held = lambda: [place.rank for place in cores._held]  # noqa: E731
-    monkeypatch.setattr(keeping.Keeper, "_ask", lambda keeper: (asked.extend(held()), ask(keeper))[1])
-    async with Client(url) as client:
-        with slot(Rank.BEGINNING):
-            await client.look()
-            await come_true(lambda: cores.queue)
-            assert not await client.wait_for(lambda: client.controls, 0.5)
-        assert await client.wait_for(lambda: client.has_picture, PATIENCE)
-    assert (taken, asked) == ([Rank.PAGE], [Rank.BEGINNING])  # which is this test
-
-
-@asynchronous
-async def test_nobody_builds_the_page_of_who_has_left_while_it_waited(url, server, monkeypatch, caplog):
-    cores, built = Cores(2, CoresSettings(patience=10 * PATIENCE)), []
-    monkeypatch.setattr(visitor_module, "CORES", cores)
-    monkeypatch.setattr(visitor_module, "ScenePictures", lambda *_what: built.append(True))
-    with cores.slot(Rank.BEGINNING):
-        async with Client(url) as client:
-            await client.look()
-            await come_true(lambda: cores.queue)
-        await come_true(lambda: not cores.queue and not server._num_building)
-    assert not built and not server.visitors
-    assert not [record for record in caplog.records if record.levelno >= logging.ERROR]
+        assert not any(neglected())
 
 
 @asynchronous
@@ -445,7 +322,7 @@ async def test_open_sockets_are_bounded_too(url, server, monkeypatch):
         except ConnectionResetError:
             return True
 
-    monkeypatch.setattr(server.gate, "limits", replace(server.gate.limits, sockets=3))
+    monkeypatch.setattr(gate, "MAX_SOCKETS", 3)
     async with AsyncExitStack() as stack:
         sockets = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(4)]
         for each in sockets:
@@ -492,6 +369,10 @@ def packed(kind, **content):
     return msgspec.msgpack.encode({"type": kind, **content})
 
 
+AT = {"start_position": [0, 0, 0], "end_position": [0, 0, 0], "start_screen_pos": [0, 0], "end_screen_pos": [0, 0]}
+DRAG = {"phase": "end", "name": OBSTACLE, "instance_index": None, "button": "left", "modifier": None, **AT}
+POSE = {"wxyz": [1, 0, 0, 0], "position": [0, 0, 0], "look_at": [0, 0, 0], "up_direction": [0, 0, 1]}
+POSE |= dict.fromkeys(("fov", "near", "far", "image_height", "image_width"), 1)
 MALFORMED = {
     "text": "hello",
     "no bytes": b"",
@@ -503,9 +384,19 @@ MALFORMED = {
     "field of another type": packed("TransformControlsDragStartMessage", name=7, owner="secret"),
     "field that is missing": packed("TransformControlsUpdateMessage", name="secret"),
     "field that there is not": packed("TransformControlsDragStartMessage", name="secret", owner="", secret=1),
-    "number too many": packed(
-        "TransformControlsUpdateMessage", name="secret", wxyz=[1, 0, 0, 0], position=[1, 2, 3, 4]
-    ),
+    **{
+        kind: packed("TransformControlsUpdateMessage", name="secret", wxyz=[1, 0, 0, 0], position=position)
+        for kind, position in (
+            ("number too many", [1, 2, 3, 4]),
+            ("number too few", [1, 2]),
+            ("no number", ["secret"] * 3),
+        )
+    },
+    "no place": packed("ScenePointerMessage", event_type="click", ray_origin=[], ray_direction="secret", screen_pos=[]),
+    "no camera": packed("ViewerCameraMessage", **POSE | {"position": ["secret", 0, 0]}),
+    "no window": packed("ViewerCameraMessage", **POSE | {"image_width": "secret"}),
+    "no phase of a drag": packed("SceneNodeDragMessage", **DRAG | {"phase": "secret"}),
+    "no turn": packed("TransformControlsUpdateMessage", name="secret", wxyz=None, position=[1, 2, 3]),
     "other property of a control": packed("GuiUpdateMessage", uuid="secret", updates={"removed": True}),
     "value that no control has": packed("GuiUpdateMessage", uuid="secret", updates={"value": {"a": [1]}}),
     "nested deep": b"\x82\xa4type\xb0GuiUpdateMessage\xa7updates" + b"\x91" * 50_000,
@@ -523,19 +414,16 @@ async def test_a_message_that_no_page_sends_ends_its_connection(url, raw, caplog
         await client.send_raw(raw)
         assert await client.is_lost()
     printed = "".join(capfd.readouterr())
-    assert "Traceback" not in caplog.text + printed
+    failed = [record for record in caplog.records if record.exc_info and record.name != "websockets.server"]
+    assert not failed and "Traceback" not in printed  # of websockets' are connections of other tests that just ended
     assert "secret" not in caplog.text + printed
 
 
-@pytest.mark.parametrize("text", ["{", "x" * 10**6], ids=["damaged", "too large for a message"])
 @asynchronous
-async def test_whatever_a_browser_keeps_the_page_opens_in_time_says_so_and_goes_on(url, server, text):
+async def test_whatever_a_browser_keeps_the_page_opens_says_so_and_goes_on(url, server):
     async with Client(url) as client:
-        client.storage = {KEY: text}
+        client.storage = {KEY: "x" * 10**6}  # too large for a message
         await client.look()
-        began = time.monotonic()
-        await come_true(lambda: server.visitors)
-        assert time.monotonic() - began < ATTEMPTS * keeping.PATIENCE / 2  # it is not asked again and again before
         assert await client.wait_for(lambda: client.has_picture and client.notices, PATIENCE)
         assert "begins anew" in " ".join(client.notices)
         await client.set("Warp", 0.5)
@@ -546,7 +434,7 @@ async def test_whatever_a_browser_keeps_the_page_opens_in_time_says_so_and_goes_
 @asynchronous
 async def test_what_nobody_has_asked_a_browser_for_changes_nothing(url, server):
     async with visiting(url) as client:
-        (visitor,) = server.visitors
+        visitor = await only_visitor(server)
         before = visitor.session.scenario
         for size in (10, 10**6):
             for error in (None, "forbidden"):
@@ -567,16 +455,16 @@ async def test_it_ends_no_other_connection(url):
 @asynchronous
 async def test_forged_values_change_nothing_and_break_nothing(url, server):
     async with visiting(url) as client:
-        (visitor,) = server.visitors
+        visitor = await only_visitor(server)
         before, camera = visitor.session.scenario, np.array(visitor.client.camera.position)
         forged = {"name": OBSTACLE, "owner": client.nodes[OBSTACLE]["owner"], "wxyz": [1, 0, 0, 0]}
-        pose = {"wxyz": [1, 0, 0, 0], "look_at": [0, 0, 0], "up_direction": [0, 0, 1]}
-        pose |= dict.fromkeys(("fov", "near", "far", "image_height", "image_width"), 1)
         for number in (float("nan"), float("inf"), -float("inf")):
             await client.send("TransformControlsUpdateMessage", **forged, position=[0, number, 0])
             await client.set("Margin [cm]", number)
-            await client.send("ViewerCameraMessage", **pose, position=[number, 0, 0])
+            await client.send("ViewerCameraMessage", **POSE | {"position": [number, 0, 0]})
+            await client.send("SceneNodeDragMessage", **DRAG | {"end_position": [0, number, 0]})
         await client.set("Margin [cm]", "no number")
+        await client.set("Margin [cm]", "nan")  # viser makes it a number
         await client.send("TransformControlsUpdateMessage", **forged | {"owner": "another"}, position=[9, 9, 9])
         await client.send("TransformControlsUpdateMessage", **forged | {"name": "/nothing"}, position=[9, 9, 9])
         await client.send("GuiUpdateMessage", uuid="nothing", updates={"value": 1})
@@ -592,33 +480,17 @@ async def test_forged_values_change_nothing_and_break_nothing(url, server):
 async def test_a_flood_is_slowed_down(url, server):
     async with visiting(url) as client:
         began = time.monotonic()
-        for _ in range(3 * int(server.gate.limits.rate)):
+        for _ in range(3 * int(gate.MAX_RATE)):
             await client.send("NoSuchMessage")
         assert await answers(client)
         assert time.monotonic() - began > 1  # the second that it began in may have been over at once
-
-
-@pytest.mark.long
-@asynchronous
-async def test_what_callbacks_raise_is_in_the_log_without_what_was_sent(url, caplog, capfd):
-    def of_the_gate():
-        return [record for record in caplog.records if record.name == gate.logger.name]
-
-    async with visiting(url) as client:
-        caplog.clear()
-        await client.set("Margin [cm]", "secret")
-        assert await answers(client)
-        await come_true(of_the_gate)
-    (record,) = of_the_gate()
-    assert record.levelno == logging.ERROR and record.exc_info
-    assert "secret" not in record.getMessage() + "".join(capfd.readouterr())
 
 
 @asynchronous
 async def test_a_visitor_who_does_not_listen_costs_no_memory(url, server):
     """What is not sent yet is replaced by what is newer."""
     async with visiting(url) as client:
-        (visitor,) = server.visitors
+        visitor = await only_visitor(server)
         (state,) = server._server._websock_server._client_state_from_id.values()
         client._receiving.cancel()
         await asyncio.gather(client._receiving, return_exceptions=True)
@@ -647,7 +519,7 @@ def uploads_of(visitor):
 @pytest.mark.parametrize(
     ("content", "announced", "said"),
     [
-        (bytes(3 * 2**20), MAX_UPLOAD + 1, "x.stl: file: found 50.0 MB; accepted: at most 50 MB"),
+        (bytes(3 * 2**20), gate.MAX_UPLOAD + 1, "x.stl: file: found 50.0 MB; accepted: at most 50 MB"),
         (bytes(2**20), None, "x.stl: "),  # it arrives, and is no mesh
     ],
     ids=["announced too large", "no mesh"],
@@ -668,6 +540,15 @@ async def test_what_is_wrong_with_a_file_is_said_and_none_of_it_is_held(url, ser
 
 
 @asynchronous
+async def test_a_file_that_is_not_sent_to_the_end_is_forgotten_where_the_next_one_begins(url, server):
+    async with visiting(url) as client:
+        for number in range(3):
+            await client.send_file(UPLOAD, "x.stl", b"", announced=2**20, transfer=f"unfinished-{number}")
+            assert await answers(client)
+        assert [*uploads_of(server.visitors[0])] == ["unfinished-2"]
+
+
+@asynchronous
 async def test_a_file_that_is_larger_than_announced_ends_the_connection(url):
     async with visiting(url) as client:
         with pytest.raises(LostError):
@@ -679,48 +560,30 @@ async def test_a_file_that_is_larger_than_announced_ends_the_connection(url):
 # --- viser ---
 
 
-def a_gate():
-    return gate.Gate(gate.Origins("127.0.0.1"), gate.Limits(1, 1, upload=1), lambda *_: None)
+def gate_at(listening):
+    return gate.Gate(listening, gate.Origins("127.0.0.1"), 1, 1, 1, lambda *_: None, Share(1, 1))
 
 
 def test_a_viser_that_serves_in_another_way_is_refused(monkeypatch):
     stopped = []
-
-    class Other:
-        def __init__(self, **_options):
-            pass
-
-        def stop(self):
-            stopped.append(self)
-
-    monkeypatch.setattr(viser, "ViserServer", Other)
+    monkeypatch.setattr(viser, "ViserServer", lambda **_options: SimpleNamespace(stop=lambda: stopped.append(True)))
     with (
         closing(listen("127.0.0.1", 0)) as listening,
         pytest.raises(GateError, match=r"viser .* has changed .*; accepted: viser 1\.1"),
     ):
-        a_gate().open(listening, "")
+        gate_at(listening)
     assert stopped
 
 
-def test_who_comes_while_the_server_is_made_waits_for_it(monkeypatch, caplog):
-    """As at a socket on which other processes have listened before."""
-    clients = []
-
-    def connect(_stop):  # which viser registers while it is half made
-        protocol = Subprotocol(f"viser-v{viser.__version__}")
-        clients.append(websockets.sync.client.connect(url, subprotocols=[protocol], proxy=None))
-        time.sleep(0.5)
-
-    monkeypatch.setattr("viser._viser.atexit", SimpleNamespace(register=connect, unregister=lambda _: None))
-    with closing(listen("127.0.0.1", 0)) as listening:
-        url = f"ws://127.0.0.1:{listening.getsockname()[1]}"
-        server = a_gate().open(listening, "")
-        try:
-            assert clients[0].recv(PATIENCE)
-            assert not [record for record in caplog.records if record.levelno >= logging.ERROR]
-        finally:
-            clients[0].close()
-            server.stop()
+def test_what_callbacks_of_viser_raise_is_logged_and_not_printed(server, caplog, capsys):
+    error, failed, modules = ValueError("of a callback"), Future(), cast(Any, viser)
+    failed.set_exception(error)
+    modules._viser.print_threadpool_errors(failed)
+    modules._gui_handles.print_task_error(failed)
+    modules._scene_api.print_awaited_callback_error(error)
+    logged = [record.exc_info for record in caplog.records if record.getMessage() == "a callback failed"]
+    assert [info is not None and info[1] for info in logged] == 3 * [error]
+    assert capsys.readouterr() == ("", "")
 
 
 @asynchronous
@@ -743,46 +606,75 @@ async def test_what_a_thread_tells_is_sent_also_just_before_the_loop_waits_for_i
     await windows.aclose()
 
 
-@asynchronous
-async def test_a_thread_wakes_nobody_itself_but_has_the_loop_do_so(server):
-    buffer = AsyncMessageBuffer(asyncio.get_running_loop(), persistent_messages=False)
-    thread = threading.Thread(target=buffer.push, args=(ResetGuiMessage(),))
-    thread.start()
-    thread.join()
-    assert not buffer.message_event.is_set()
-    await asyncio.wait_for(buffer.message_event.wait(), PATIENCE)
-    buffer.message_event.clear()
-    buffer.push(ResetGuiMessage())
-    assert buffer.message_event.is_set()
+def test_the_patches_were_tried_with_this_version_of_viser():
+    """Another version is added after a trial of tests/ui and tests/browser with it.
+
+    With 1.1.0 alone, a page that plays is larger than tests/ui/test_recording.py allows.
+    """
+    assert viser.__version__ in {"1.1.0", "1.1.1"}
 
 
 def test_a_viser_with_other_messages_is_refused(monkeypatch):
     monkeypatch.delattr("viser._messages.SceneNodeDragMessage")
     with pytest.raises(GateError, match=r"SceneNodeDragMessage.*; accepted: viser 1\.1"):
-        a_gate()
+        gate_at(None)
 
 
-def test_the_types_of_properties_are_evaluated_once_for_each_class(server):
-    scene = server._server.scene
-    handles = [scene.add_frame("/typed"), scene.add_frame("/typed/too"), scene.add_label("/typed/label", "")]
-    hints = [handle._prop_hints for handle in handles]
-    assert hints[0] is hints[1] and hints == [get_type_hints(type(handle._impl.props)) for handle in handles]
-    handles[0].remove()
-
-
-@pytest.mark.parametrize("path", ["/", "/window/a", "/window/a/9999999", "/window/a/20", "/window/a b/390", "/390"])
-def test_other_requests_tell_no_width(path):
-    assert told("/window/a/390") == ("a", 390.0)
-    assert told(path) is None
+BAD_REPORTS = ["", "390", "{", '{"width": 20}', '{"width": 99999}', '{"width": "390"}', '{"width": 390.5}', "\ud800",
+    '{"width": 390, "link": {"kind": "file", "name": "a"}}', '{"width": 390, "link": {"kind": "scene", "name": 4}}',
+    '{"width": 390, "link": {"kind": "scene", "name": "%s"}}' % ("a" * 101), '{"width": 390, "key": 1}']  # fmt: skip
 
 
 @asynchronous
-async def test_a_browser_tells_the_width_of_its_own_window(server, url):
+async def test_a_page_reports_its_link_and_the_width_of_its_window_and_nothing_else_is_taken_for_it(server, url):
     async with visiting(url) as client:
-        (visitor,) = server.visitors
-        assert any(control.get("content") == visitor.ruler.html for control in client.controls.values())
-        for ruler, width in ((Ruler(), None), (visitor.ruler, 390)):
-            address = f"http://127.0.0.1:{server.port}/window/{ruler.token}/390"
-            with await asyncio.to_thread(urllib.request.urlopen, address) as response:
-                assert response.status == 204
-            assert visitor._camera._width == width
+        visitor = await only_visitor(server)
+        for text in BAD_REPORTS:
+            with contextlib.suppress(UnicodeEncodeError):  # a browser cannot send it
+                await client.set("Window", text)
+        await client.set("Warp", 0.5)
+        assert await client.wait_for(lambda: visitor.session.scenario.warp == 0.5, PATIENCE)
+        assert visitor._camera._width is None and visitor.session.scenario.task == "draw_s"
+        await client.report(width=390, link={"kind": "task", "name": "draw_j"})
+        assert await client.wait_for(lambda: visitor.session.scenario.task == "draw_j", PATIENCE)
+        assert visitor._camera._width == 390
+
+
+def answer(server, request):
+    """All bytes that the server answers to a request, until it closes the connection."""
+    with socket.create_connection(("127.0.0.1", server.port), timeout=PATIENCE) as sock:
+        for part in request:
+            sock.sendall(part)
+        received = b""
+        while piece := sock.recv(65536):
+            received += piece
+    return received
+
+
+HOST = b"/health HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+
+
+@pytest.mark.parametrize("parts", [[b"HEAD " + HOST], [b"H", b"EAD ", HOST]], ids=["whole", "in pieces"])
+def test_head_is_answered_as_get_is_without_the_body(server, parts):
+    head, got = answer(server, parts), answer(server, [b"GET " + HOST])
+    headers, body = got.split(b"\r\n\r\n")
+    assert head.startswith(b"HTTP/1.1 200") and body.startswith(b"{")
+
+    def undated(text):
+        return [line for line in text.split(b"\r\n") if not line.startswith(b"Date")]
+
+    assert undated(head) == [*undated(headers), b"", b""]
+
+
+REFUSED = {
+    "foreign host": ([b"HEAD / HTTP/1.1\r\nHost: evil.example\r\n\r\n"], rb"HTTP/1\.1 421"),
+    "no request": ([b"\x16\x03\x01" + bytes(60)], rb"$"),
+}
+for method, body in itertools.product((b"POST", b"OPTIONS", b"PUT", b"DELETE", b"PROPFIND"), (b"", b"a=1" * 1000)):
+    head = method + b" / HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: %d\r\n\r\n" % len(body)
+    REFUSED[f"{method.decode()} {len(body)}"] = [head, body], rb"(?s)HTTP/1\.1 405.*Allow: GET, HEAD\r\n"
+
+
+@pytest.mark.parametrize(("parts", "said"), REFUSED.values(), ids=REFUSED)
+def test_other_requests_are_refused_with_the_methods_that_are_allowed(server, parts, said):
+    assert re.match(said, answer(server, parts))

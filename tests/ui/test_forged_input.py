@@ -4,13 +4,12 @@ import dataclasses
 import inspect
 import itertools
 import math
-import threading
 from typing import Any
 
 import numpy as np
 import pytest
 import viser  # noqa: TID251 - forges what a browser sends
-from pages import CLIENT, MIDDLE, PATIENCE, Page, wait_until
+from pages import CLIENT, MIDDLE, Page, wait_until
 from viser import _messages as messages  # noqa: TID251
 
 from dt_viz.avoidance.detour import DetourSettings
@@ -18,34 +17,31 @@ from dt_viz.scenario.paper_scenes import offered
 from dt_viz.scenario.scenario import View
 from dt_viz.scenario.stack import anchored
 from dt_viz.scenario.tasks import TASKS
-from dt_viz.session.session import CHOICES
-from dt_viz.ui import controls, gestures
-from dt_viz.ui.scene import markers
+from dt_viz.ui import bindings
+from dt_viz.ui.scene import draggables, markers
 from dt_viz.ui.scene.camera import view_of
-from dt_viz.ui.tabs.tour import LANE
 
 SCENES = offered(TASKS)
-BORDERS = {controls.__name__, gestures.__name__, markers.__name__}
+BORDERS = {bindings.__name__, draggables.__name__, markers.__name__}
 UPLOAD = viser.GuiUploadButtonHandle
 FILE = viser.UploadedFile(name="x", content=b"\0" * 100)
 NO_NUMBERS = (math.nan, math.inf, -math.inf, 1e300, -1e300)
-CLAIMS = [*NO_NUMBERS, 1e6, -9, 0, 2**70, True, None, "", "x" * 1_000_000, [], {}, FILE]
+CLAIMS = [*NO_NUMBERS, 1e6, -9, 0, 2**70, "9" * 4000, "nan", True, None, "", "x" * 1_000_000, [], {}, FILE]
 PLACES = [
     *((number, 0.1, 0.2) for number in (math.nan, -math.inf, 1e300, 6.0)),
     *((0.1, 0.2, number) for number in (math.inf, -1e300)),
-    *((0.1, 0.2), (), None, "abc", ((1.0, 2.0, 3.0),), ("a", "b", "c")),
 ]
-TURNS = [(0.0,) * 4, (math.nan, 0.0, 0.0, 0.0), (1e300, 0.0, 0.0, 0.0), (1.0, 0.0, 0.0), None, "wxyz"]
+TURNS = [(0.0,) * 4, (math.nan, 0.0, 0.0, 0.0), (1e300, 0.0, 0.0, 0.0)]
 
 
 @pytest.fixture(autouse=True)
 def _at_rest(page):
-    """No presentation, no tour, and a camera that stays where it is put: something forged may have begun others."""
+    """No presentation, tour or gesture, and a camera that stays where it is put: a forgery may have begun one."""
+    page.session.end_gesture()  # while one goes on, an edit is shown with its frame, not at once
     page.visitor._panel.presentation.show(False)
-    for lane in (LANE, CHOICES):
-        assert page.session.jobs.wait_idle(lane, PATIENCE)
+    page.settle()
     page.visitor._panel.tour.end(page.session)
-    assert page.session.jobs.wait_idle(CHOICES, PATIENCE)
+    page.settle()
     for switch in page.inputs:
         if switch.label in ("Orbit", "Lock camera") and switch.value:
             page.claim(switch, False)
@@ -178,7 +174,7 @@ def test_every_value_that_a_control_offers_is_taken(page):
         }.get(type(handle), lambda h: ())(handle)
         for value in offered:
             if handle.visible and not handle.disabled:
-                assert controls.allowed(handle, value) == value, (handle.label, value)
+                assert bindings.allowed(handle, value) == value, (handle.label, value)
 
 
 @pytest.mark.parametrize("position", PLACES, ids=repr)
@@ -246,7 +242,7 @@ def test_nothing_in_the_scene_is_dragged_to_or_seen_from_what_is_no_place(page, 
     page.busy()
     dragged = [name for name, node in page.nodes.items() if node._impl.drag_cb]
     assert len(dragged) >= 7
-    for name, phase in itertools.product(dragged, ("start", "update", "end", "again", None)):
+    for name, phase in itertools.product(dragged, ("start", "update", "end")):
         page.drag(name, place, MIDDLE, phase)
         page.drag(name, MIDDLE, place, phase)
         assert_sound(page)
@@ -256,7 +252,7 @@ def test_nothing_in_the_scene_is_dragged_to_or_seen_from_what_is_no_place(page, 
         assert_sound(page)
 
 
-@pytest.mark.parametrize("ray", [*PLACES, (0.0, 0.0, 0.0)], ids=repr)
+@pytest.mark.parametrize("ray", [*PLACES, (0.0, 0.0, 0.0), None], ids=repr)
 def test_a_ray_that_is_none_adds_no_start(page, ray):
     before = page.busy()
     for origin, direction in ((ray, (0.0, 1.0, 0.0)), ((0.8, -1.6, 0.8), ray)):
@@ -272,7 +268,7 @@ def test_reset_and_commands_bring_the_camera_back(page):
     camera.look(task)
     for act, view in (
         (lambda: page.claim(page["History"], "Undo"), None),
-        (lambda: page.claim(page["History"], "Reset"), "Home"),
+        (lambda: page.claim(page["Reset"], "Reset"), "Home"),
         (lambda: page.give(page.commands["View: Top"]), "Top"),
         (lambda: page.give(page.commands["Frame: move the camera back"]), "Home"),
     ):
@@ -281,26 +277,6 @@ def test_reset_and_commands_bring_the_camera_back(page):
         seen = page.camera.position, page.camera.look_at
         wanted = view_of(task, camera.framing, view) if view else (np.full(3, 9.0), np.ones(3))
         np.testing.assert_array_equal(seen, wanted)
-
-
-def test_clicks_on_save_png_are_not_done_by_the_threads_that_welcome_visitors(page, monkeypatch):
-    asked, answer = [], threading.Event()
-
-    def render(*_size, **_how):
-        asked.append(threading.current_thread())
-        assert answer.wait(30)
-        return np.zeros((2, 2, 4), np.uint8)
-
-    monkeypatch.setattr(page.client, "get_render", render)
-    button = page["Save picture"]
-    page.claim(button, True)
-    wait_until(lambda: asked)
-    for _ in range(40):  # cancel it
-        page.claim(button, True)
-    assert page.gui._thread_executor.submit(lambda: True).result(timeout=20)
-    answer.set()
-    assert page.session.jobs.wait_idle("Save picture", 30)
-    assert [thread.name for thread in asked] == ["worker_0"]
 
 
 def test_commands_do_what_the_controls_do_each_on_a_key_of_its_own(page):
@@ -322,7 +298,7 @@ def test_commands_do_what_the_controls_do_each_on_a_key_of_its_own(page):
     titles = [command.label for command in commands.values()][-len(SCENES) :]
     assert titles == [scene.title for scene in SCENES]
     page.give(by_key["2", None])
-    assert page.session.jobs.wait_idle(CHOICES, 30)
+    page.settle()
     assert page.session.scenario.scene == SCENES[1].name
     page.session.leave_scene()
 
@@ -364,7 +340,7 @@ def test_the_presentation_goes_from_scene_to_scene_and_folds_no_panel(page, monk
     page.session.leave_scene()
 
     def shown():
-        assert page.session.jobs.wait_idle(CHOICES, 30)
+        page.settle()
         return page.session.scenario.scene
 
     def is_on():
@@ -383,19 +359,16 @@ def test_the_presentation_goes_from_scene_to_scene_and_folds_no_panel(page, monk
     page.claim(buttons, "Next")
     assert shown() == scenes[1]
     told = []
-    monkeypatch.setattr(page.gui._websock_interface, "queue_message", told.append)
-    page.give(page.commands["Hide the panel, or show it"])
-    assert told == []
+    with monkeypatch.context() as patch:
+        patch.setattr(page.gui._websock_interface, "queue_message", told.append)
+        page.give(page.commands["Hide the panel, or show it"])
+        assert told == []
     page.claim(buttons, "End")
     assert not is_on()
     page.session.leave_scene()
     page.give(page.commands["Next scene"])
     assert shown() == scenes[0]
     page.session.leave_scene()
-
-
-def test_the_panel_is_folded_and_unfolded_by_a_command(page, monkeypatch):
-    told = []
     monkeypatch.setattr(page.gui._websock_interface, "queue_message", told.append)
     for folded in (True, False, True, False):
         page.give(page.commands["Hide the panel, or show it"])

@@ -1,19 +1,17 @@
-"""Playback: the arm in the loop, its finished motion, or what it did before, on a thread of its own."""
+"""Playback: the arm in the loop, its finished motion, or what it did before, on a thread of its own; its memory."""
 
 import threading
-import time
-from contextlib import contextmanager
+from contextlib import nullcontext
 from typing import Any, cast
 
 import numpy as np
 import pytest
-from pages import PATIENCE, wait_until
+from pages import PATIENCE
 
 from dt_viz.motion.following import ArmMotion
-from dt_viz.session.jobs import Jobs
-from dt_viz.session.recording import LEAST, Past
+from dt_viz.scheduler import Jobs, Scheduler
 from dt_viz.session.robot_loop import RoundSettings
-from dt_viz.ui.playback import Playback, PlaybackSettings, Replay
+from dt_viz.ui.playback import LEAST, NUM_SAMPLES, SPAN, Past, Playback, PlaybackSettings, Recording, Replay
 
 PICTURE, REST = 0.02, RoundSettings().rest
 FAST = PlaybackSettings(shortest=1 / 200, asleep=1 / 100)
@@ -93,13 +91,6 @@ def test_both_arms_are_shown_at_the_same_moment(moment):
         np.testing.assert_allclose(got, [np.interp(moment, times, angle) for angle in path.T], atol=1e-12)
 
 
-def test_the_arm_moves_without_being_asked_to():
-    arm, moved = Arm(), threading.Event()
-    _, jobs = playback_of(arm, lambda: moved.set() if arm.q[0] > 0.1 else None)
-    assert moved.wait(PATIENCE)
-    jobs.close()
-
-
 def test_an_arm_that_cannot_move_is_said_to_and_waits_for_its_next_motion():
     arm: Any = Arm()
     said, moved = [], threading.Event()
@@ -118,6 +109,15 @@ def test_an_arm_that_cannot_move_is_said_to_and_waits_for_its_next_motion():
     assert [str(error) for error in said] == ["no way"]
 
 
+def test_it_moves_between_frames_of_drags(monkeypatch):
+    slots, moved, drawn = Scheduler(2), [], threading.Event()
+    monkeypatch.setattr("dt_viz.ui.playback.SCHEDULER", slots)
+    monkeypatch.setattr(slots, "between_drags", lambda: nullcontext(moved.append(True)))
+    _, jobs = playback_of(Arm(), drawn.set)
+    assert drawn.wait(PATIENCE) and moved
+    jobs.close()
+
+
 def test_nothing_moves_before_it_begins():
     """The page that it draws on is being built."""
     arm, drawn = Arm(), threading.Event()
@@ -126,56 +126,6 @@ def test_nothing_moves_before_it_begins():
     playback.begin(jobs, unexpected)
     assert drawn.wait(PATIENCE)
     jobs.close()
-
-
-def test_each_picture_waits_for_its_turn_and_what_fails_in_it_gives_it_back():
-    arm: Any = Arm()
-    may, drawn, said, given_back = threading.Semaphore(0), threading.Semaphore(0), [], []
-
-    @contextmanager
-    def turn():
-        may.acquire(timeout=PATIENCE)
-        yield
-        given_back.append(True)
-
-    def draw():
-        drawn.release()
-        if len(arm.asked) == 2:
-            raise ValueError("no way")
-
-    arm.stop = lambda: None
-    playback, jobs = Playback(cast(Any, arm), draw, FAST), Jobs(unexpected)
-    playback.begin(jobs, said.append, turn)
-    for number in range(1, 4):
-        assert not drawn.acquire(timeout=0.1)
-        assert len(given_back) == number - 1
-        may.release()
-        assert drawn.acquire(timeout=PATIENCE)
-        wait_until(lambda: len(given_back) == number)  # noqa: B023
-    assert [str(error) for error in said] == ["no way"]
-    jobs.close()
-    may.release()
-    assert jobs.wait_idle(timeout=PATIENCE)
-
-
-def test_the_longer_a_picture_takes_the_fewer_there_are():
-    begun, enough = [], threading.Event()
-
-    def draw():
-        begun.append(time.monotonic())
-        time.sleep(0.005)
-        if len(begun) > 5:
-            enough.set()
-
-    settings = PlaybackSettings(shortest=1e-3, longest=PATIENCE)
-    _, jobs = playback_of(Arm(), draw, settings=settings)
-    assert enough.wait(PATIENCE)
-    jobs.close()
-    assert np.diff(begun)[1:].min() > 0.9 * 0.005 / settings.part
-
-
-def test_an_arm_never_falls_behind_however_few_pictures_there_are():
-    assert PlaybackSettings().longest < RoundSettings().longest
 
 
 def test_the_arm_of_a_neglected_page_comes_to_the_goal_and_rests_there_until_it_is_touched():
@@ -234,26 +184,10 @@ class TestReplay:
         player.playback.replay.motion = ramp(5.0, 6.0, 0.5)
         assert player.play(PICTURE)[-1] == pytest.approx(5.44)
 
-    def test_the_time_at_the_goal_is_counted_from_arrival_to_the_next_round(self, player):
-        rests = []
-        for _ in range(200):
-            player.play(PICTURE)
-            rests.append((player.places[-1], player.playback.arm.arrived))
-        assert all((rest > 0) <= (place == 4.0) for place, rest in rests)
-        assert REST - 2 * PICTURE < max(rest for _, rest in rests) <= REST
-
     def test_the_arm_goes_on_in_the_loop_from_where_the_replay_left_it(self, player):
         left = player.play(0.3)[-1]
         player.playback.play(True, 1.0, replays=False)
         assert player.play(PICTURE)[-1] == pytest.approx(left + PICTURE)
-
-    def test_without_a_motion_nothing_is_posed(self, player):
-        player.playback.replay.motion = None
-        assert (
-            player.playback.arm.q is None
-            and player.playback.arm.undisturbed is None
-            and player.playback.arm.arrived == 0
-        )
 
 
 @pytest.fixture
@@ -265,27 +199,17 @@ def replay():
 
 
 class TestPlayer:
-    @pytest.mark.parametrize("moment", [0.0, 0.01, 0.7, 1.2345, 2.0])
-    def test_what_is_shown_is_between_the_samples_beside_the_moment(self, replay, moment):
-        replay.seek(moment)
-        assert replay.moment == moment and not replay.playing
-        assert replay.q[0] == pytest.approx(np.interp(moment, replay.motion.times, replay.motion.q[:, 0]), abs=1e-12)
-        assert (replay.q[1:] == 0).all()
-
-    def test_it_is_held_where_it_is_taken_to_and_plays_on_from_there(self, replay):
-        replay.seek(0.5)
-        replay.advance(0.3)
-        assert replay.moment == 0.5
+    def test_it_is_held_where_it_is_taken_to_within_its_ends_and_plays_on_from_there_at_its_speed(self, replay):
+        for moment in (-1.0, 1e9, 0.5):
+            replay.seek(moment)
+            replay.advance(0.3)
+            assert replay.moment == np.clip(moment, 0.0, 2.0) and not replay.playing
+        replay.speed = 2.0
         replay.play()
         replay.advance(0.3)
-        assert replay.moment == pytest.approx(0.8)
+        assert replay.moment == pytest.approx(1.1)
 
-    @pytest.mark.parametrize("moment", [-1.0, 1e9])
-    def test_it_is_taken_no_farther_than_its_ends(self, replay, moment):
-        replay.seek(moment)
-        assert replay.moment == np.clip(moment, 0.0, 2.0)
-
-    def test_a_step_is_one_sample(self, replay):
+    def test_a_step_is_one_sample_or_from_between_two_to_the_one_beside(self, replay):
         times = replay.motion.times
         replay.seek(0.0)
         seen = [replay.moment]
@@ -299,21 +223,11 @@ class TestPlayer:
         np.testing.assert_array_equal(seen[len(times) :], times[-2::-1])
         replay.step(-1)
         assert replay.moment == 0.0
-
-    def test_a_step_from_between_two_samples_goes_to_the_one_beside(self, replay):
-        times = replay.motion.times
         for num, expected in ((1, times[11]), (-1, times[10])):
             replay.play()
             replay.seek((times[10] + times[11]) / 2)
             replay.step(num)
             assert replay.moment == expected and not replay.playing
-
-    @pytest.mark.parametrize("speed", [0.25, 1.0, 3.0])
-    def test_its_time_passes_at_its_speed(self, replay, speed):
-        replay.speed = speed
-        for _ in range(10):
-            replay.advance(0.05)
-        assert replay.moment == pytest.approx(0.5 * speed)
 
     def test_in_a_loop_it_begins_anew_after_a_rest(self, replay):
         replay.seek(1.9)
@@ -340,7 +254,8 @@ class TestPlayer:
         replay.play()
         replay.loops = False
         replay.advance(0.3)
-        assert replay.moment == replay.duration == 0.0 and replay.q is None and len(replay.trace[0]) == 0
+        assert replay.moment == replay.duration == replay.arrived == 0.0 and len(replay.trace[0]) == 0
+        assert replay.q is None and replay.undisturbed is None
 
 
 class TestPast:
@@ -357,32 +272,24 @@ class TestPast:
         assert set(past.motion.q[:, 0]) <= set(places) and len(past.motion.q) > 0.8 * 1.0 / (LEAST + PICTURE)
         assert (past.undisturbed == 1).all()
 
-    def test_the_robot_goes_on_meanwhile_and_is_shown_again(self, player):
+    def test_the_robot_goes_on_meanwhile_is_remembered_too_and_shown_again(self, player):
         player.playback.rewind()
-        left = player.arm.q[0]
+        left, before = player.arm.q[0], player.playback.past.duration
         held = player.play(0.5)
         assert len(set(held)) == 1 and player.arm.q[0] == pytest.approx(left + 0.5)
-        player.playback.resume()
-        assert player.play(PICTURE)[-1] == pytest.approx(left + 0.5 + PICTURE)
-
-    def test_what_it_does_meanwhile_is_remembered_too(self, player):
-        player.playback.rewind()
-        before = player.playback.past.duration
-        player.play(0.5)
         assert player.playback.past.duration == before
         player.playback.rewind()
         assert player.playback.past.duration == pytest.approx(before + 0.5, abs=LEAST)
+        player.playback.resume()
+        assert player.play(PICTURE)[-1] == pytest.approx(left + 0.5 + PICTURE)
 
-    def test_another_choice_leaves_it_shown_until_the_motion_is_chosen(self, player):
+    def test_another_choice_leaves_it_shown_until_the_motion_is_chosen_and_the_robot_where_it_was(self, player):
         player.playback.rewind()
         player.playback.play(False, 2.0, replays=False)
         assert player.playback.player is player.playback.past
-        player.playback.play(True, 1.0, replays=True)
-        assert player.playback.player is player.playback.replay
-
-    def test_from_the_motion_to_the_past_and_back_the_robot_is_where_it_was(self, player):
         player.playback.replay.motion = ramp(3.0, 4.0, 0.5)
         player.playback.play(True, 1.0, replays=True)
+        assert player.playback.player is player.playback.replay
         player.play(0.1)
         left = player.arm.q[0]
         player.playback.rewind()
@@ -400,20 +307,6 @@ class TestPast:
         player.play(0.5)
         player.playback.rewind()
         assert player.playback.past.duration == pytest.approx(1.5, abs=2 * LEAST)
-
-    def test_each_jump_is_counted(self, player):
-        playback, counted = player.playback, []
-        for jump in (playback.rewind, lambda: playback.past.step(-1), lambda: playback.past.seek(0.2), playback.resume):
-            before = playback.jumps
-            jump()
-            counted.append(playback.jumps - before)
-        assert counted == [1, 1, 1, 1]
-        player.play(0.3)
-        assert playback.jumps == before + 1
-
-
-def test_nothing_is_shown_of_a_robot_that_has_done_nothing(player):
-    assert not player.playback.rewind() and player.playback.player is None
 
 
 def test_what_it_did_since_it_set_out_is_traced():
@@ -445,3 +338,52 @@ def test_a_film_is_drawn_while_all_else_waits_and_goes_on_afterwards(player, sho
     playback.film = None
     assert playback.arm is arm and arm.q[0] == place and playback.jumps == jumps
     assert player.play(0.2)[-1] > place
+
+
+# --- What the robot has just done ---
+
+PERIOD = 1 / 20
+
+
+def recorded(num, period=PERIOD) -> Any:
+    """A recording of so many samples, whose postures are their numbers."""
+    recording = Recording()
+    for k in range(num):
+        add(recording, k, period)
+    return recording
+
+
+def add(recording, k, period=PERIOD):
+    recording.add(period, np.full(6, float(k)), np.full(6, -float(k)), float(k), seeks=k % 2 == 0)
+
+
+@pytest.mark.parametrize("num", [2, 500, NUM_SAMPLES, NUM_SAMPLES + 1, 3 * NUM_SAMPLES + 7])
+def test_the_samples_are_the_newest_in_their_order(num):
+    past = recorded(num).past
+    numbers = np.arange(num - len(past.times), num)
+    np.testing.assert_array_equal(past.q, np.tile(numbers[:, None], 6))
+    np.testing.assert_array_equal(past.without, -past.q)
+    np.testing.assert_array_equal(past.arrived, numbers)
+    np.testing.assert_array_equal(past.seeks, numbers % 2 == 0)
+    np.testing.assert_allclose(past.times, PERIOD * np.arange(len(numbers)), atol=1e-9)
+
+
+@pytest.mark.parametrize("period", [0.01, 1.01 * LEAST, PERIOD, 1 / 6, 7.0])
+def test_the_last_minute_is_remembered_however_many_pictures_there_are(period):
+    past, apart = recorded(7000, period).past, np.ceil(LEAST / period)  # number of pictures from sample to sample
+    assert SPAN - apart * period - 1e-6 < past.times[-1] <= SPAN + 1e-9
+    assert np.diff(past.times).min() >= LEAST and np.diff(past.q[:, 0]).max() <= apart
+    assert 7000 - apart <= past.q[-1, 0] < 7000
+
+
+def test_it_begins_with_two_samples():
+    assert recorded(0).past is None and recorded(1).past is None and len(recorded(2).past.times) == 2
+
+
+def test_what_was_read_stays_as_it_was():
+    recording = recorded(NUM_SAMPLES)
+    past = recording.past
+    before = past.q.copy()
+    for k in range(NUM_SAMPLES):
+        add(recording, -k)
+    np.testing.assert_array_equal(past.q, before)

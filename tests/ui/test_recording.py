@@ -10,15 +10,16 @@ import pytest
 import zstandard
 
 from dt_viz.errors import UnwantedError, end_if
-from dt_viz.robot.models import load_arm
+from dt_viz.scenario.scenario import View
 from dt_viz.session.frame import Stage
 from dt_viz.session.robot_loop import RoundSettings
 from dt_viz.ui.patches import Tape
-from dt_viz.ui.scene.arm import ArmFrames, Arms
-from dt_viz.ui.scene.recording import RecordingSettings, record
+from dt_viz.ui.scene.arm import ArmFrames
+from dt_viz.ui.scene.figure import key_of
+from dt_viz.ui.scene.palette import LIGHT
+from dt_viz.ui.scene.recording import RATE, record
 
-MOST = 5e6
-"""Largest size of a page, bytes."""
+MOST = 5e6  # largest size of a page, bytes
 
 
 @pytest.fixture(scope="module")
@@ -48,21 +49,20 @@ def test_it_is_titled_and_small(page, frame):
     assert f"<title>{frame.task.title} – DT-Viz</title>" in page.decode()
 
 
-@pytest.mark.long
-def test_the_largest_arm_leaves_room_for_a_scene(page):
-    def size_of(robot):
-        tape = Tape()
-        Arms(tape.scene, robot)
-        return len(tape.html())
-
-    assert size_of(load_arm("so101")) + len(page) - size_of(load_arm("jaco")) < MOST
+def test_a_legend_names_what_is_shown_with_the_scale_of_the_slice(page, at_rest, engine, initial):
+    assert "<summary>Legend</summary>" in page.decode() and "det J" not in page.decode()
+    shown = View(demonstrations=False, colour="det")
+    frame = at_rest(replace(initial("draw_s"), view=shown), Stage.CERTIFIED)
+    assert [name for name, _ in key_of(frame).lines] == ["undisturbed", "rollouts", "obstacle", "goal"]
+    assert dict(key_of(frame).lines)["rollouts"] == LIGHT.rollout
+    assert "det J: volume" in record(frame, engine.follower).decode()
 
 
 def test_its_joints_go_along_the_frames_motion(page, frame, robot):
     duration, messages = recorded(page)
-    np.testing.assert_allclose(duration, frame.arm.times[-1] + RoundSettings.rest, atol=1 / RecordingSettings.rate)
+    np.testing.assert_allclose(duration, frame.arm.times[-1] + RoundSettings.rest, atol=1 / RATE)
     turns = [(time, told) for time, told in messages if told["type"] == "SetOrientationMessage"]
-    assert len({time for time, _ in turns}) > 0.6 * duration * RecordingSettings.rate
+    assert len({time for time, _ in turns}) > 0.6 * duration * RATE
     tape = Tape()
     expected = ArmFrames(tape.scene, robot, "/arm")
     for joint in range(robot.num_joints):

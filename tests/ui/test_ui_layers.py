@@ -1,6 +1,7 @@
 """What the page shows of the whole arm, without a browser: a scene takes handles also while nobody looks."""
 
 from dataclasses import fields, replace
+from itertools import pairwise
 from typing import cast
 
 import numpy as np
@@ -8,23 +9,32 @@ import pytest
 import trimesh
 from other_arms import OTHER_ARMS
 from pages import frame_of, ignored
-from scenes import avoiding, changed, frame_at
+from scenes import avoiding, changed
+from scipy.spatial import KDTree
 from viser import transforms  # noqa: TID251
 
+from dt_viz.kernels.tubes import evenly_bent, tubes
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.robot.models import load_jaco
-from dt_viz.scenario.panels import BASE_PANEL
 from dt_viz.scenario.scenario import View
+from dt_viz.scenario.slices import BASE_PANEL
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.engine import ArmMotion
-from dt_viz.session.frame import Stage
-from dt_viz.ui.scene.arm import NUM_ARMS, SEEN, ArmPicture, Arms, ArmSequence, arms_along
-from dt_viz.ui.scene.links import CELL, bodies, light_links, simplified
-from dt_viz.ui.scene.palette import LIGHT
+from dt_viz.ui.scene.arm import (
+    CELL,
+    NUM_ARMS,
+    Arms,
+    ArmSequence,
+    arms_along,
+    bodies,
+    light_links,
+    simplified,
+)
+from dt_viz.ui.scene.palette import LIGHT, STYLES
 from dt_viz.ui.scene.picture import Arrows, Lines, Look
-from dt_viz.ui.scene.rollouts import HandAxes, Rollouts
+from dt_viz.ui.scene.rollouts import HandAxes, Rollouts, demonstrations, ghost
 from dt_viz.ui.scene.scene import OF_A_MOTION, OF_A_TASK, ScenePictures
-from dt_viz.ui.scene.style import STYLES
+from dt_viz.ui.scene.tubes import INSIDE, NUM_RINGS, NUM_SIDES, RolloutTubes, tube_faces
 from dt_viz.ui.tabs.plots import NUM_SAMPLES, JointPlots, joint_curves
 from dt_viz.ui.tabs.show import IN_SCENE
 
@@ -148,20 +158,6 @@ def test_an_arm_with_other_joints_is_drawn_where_its_kinematics_say(server, scen
     assert len(plots.speeds.data) == 2 + robot.num_joints
 
 
-def test_arms_along_the_motion_send_nothing_while_hidden_and_follow_while_shown(scene):
-    onion = ArmSequence(scene, ROBOT)
-    before = onion.links[1].batched_positions.copy()
-    onion.draw(frame(motion()), Look())
-    np.testing.assert_array_equal(onion.links[1].batched_positions, before)
-    onion.visible = True
-    earlier = onion.links[1].batched_wxyzs.copy()
-    onion.draw(frame(replace(motion(), q=motion().q + 0.2)), Look())
-    shown = onion.links[1].batched_wxyzs.copy()
-    assert np.abs(shown - earlier).max() > 0.05
-    onion.draw(frame(None), Look())  # no motion: they stay
-    np.testing.assert_array_equal(onion.links[1].batched_wxyzs, shown)
-
-
 def test_body_points_move_with_the_arm_and_lines_say_from_where(scene):
     arms, points = Arms(scene, ROBOT), load_jaco().body
     q, without = REACHING, REACHING - 0.2 * np.eye(6)[0]
@@ -218,7 +214,9 @@ def test_what_lies_on_the_slice_is_hidden_while_it_belongs_to_another_motion(eng
         pictures.draw(frame)
         pictures.adopt(scenario)
         assert shown() == expected
-        assert pictures.layer("rollouts").visible
+        rollouts = cast(Rollouts, pictures.layer("rollouts"))
+        colours = np.array([rollouts.followed.node.color, rollouts.others.node.color])
+        assert rollouts.visible and ((np.ptp(colours, axis=1) < 20) == blocked).all()  # grey, until there are new ones
     pictures.draw(next(engine.frames(good)))
     assert shown() == {*OF_A_MOTION, "colour"}
 
@@ -235,19 +233,6 @@ def drawn(engine, initial, scene):
     pictures.adopt(scenario)
     pictures.draw(next(engine.frames(scenario)))
     return pictures, scenario
-
-
-def test_rollouts_of_another_scenario_are_grey_until_there_are_new_ones(drawn):
-    pictures, _ = drawn
-    rollouts, last = cast(Rollouts, pictures.layer("rollouts")), pictures._frame
-
-    def colours(blocked):
-        pictures.draw(replace(last, blocked=blocked))
-        return np.array([rollouts.followed.node.color, rollouts.others.node.color])
-
-    fresh, stale = colours(()), colours(("the obstacle touches the base",))
-    assert np.ptp(fresh, axis=1).min() > 60 and np.ptp(stale, axis=1).max() < 20
-    np.testing.assert_array_equal(colours(()), fresh)
 
 
 def test_the_hands_axes_stand_along_the_motion_where_it_has_an_orientation(scene, monkeypatch):
@@ -285,20 +270,6 @@ def test_lines_that_rollouts_cover_are_drawn_where_the_rollouts_are_hidden(drawn
     pictures.adopt(scenario)
     np.testing.assert_array_equal(ghost.points, before[0])
     np.testing.assert_array_equal(demonstrations.points, before[1])
-
-
-def test_lines_that_rollouts_cover_follow_a_drag_with_the_field(drawn, engine):
-    pictures, scenario = drawn
-    demonstrations = pictures.layer("demonstrations").node
-    before = demonstrations.points
-    x, y, z = scenario.obstacles[0].position
-    moved = changed(scenario, obstacles=scenario.obstacles[0].moved((x + 0.05, y, z)))
-    first, live = (frame_at(engine, moved, stage) for stage in (Stage.ROLLOUTS, Stage.LIVE))
-    pictures.draw(first)
-    np.testing.assert_array_equal(demonstrations.points, before)
-    pictures.draw(live)
-    covered = pictures.look.tubes.outside(pictures.layer("demonstrations")._lines.segments(first.task.paths))
-    assert len(demonstrations.points) == len(covered) and not np.array_equal(demonstrations.points, before)
 
 
 @pytest.mark.parametrize("changes", [{"task": "lift_box"}, {"scene": "cloud"}, {"objective": "velocity"}], ids=str)
@@ -362,24 +333,18 @@ def test_two_samples_at_one_time_give_a_finite_speed():
     assert np.isfinite(joint_curves(arm, ROBOT).speeds).all()
 
 
-def test_plots_are_drawn_only_while_shown_with_the_limits_of_limited_joints(server):
+def test_plots_have_the_limits_of_limited_joints_and_stay_where_there_is_no_motion(server):
     plots = JointPlots(server.gui)
     plots.take(ROBOT)
-    plots.follow(motion())
-    assert len(plots.angles.data[0]) != NUM_SAMPLES
     plots.visible = True
-    for plot in (plots.angles, plots.speeds):
-        assert {len(column) for column in plot.data} == {NUM_SAMPLES} and len(plot.data) == len(plot.series)
-    limits = sorted({column[0] for column in plots.angles.data[7:]})
-    finite = np.concatenate([limit[np.isfinite(limit)] for limit in (ROBOT.lower, ROBOT.upper)])
-    np.testing.assert_allclose(limits, np.sort(np.degrees(finite)))
-    assert (plots.speeds.data[7] == 100).all()
-    before = plots.angles.data
-    plots.follow(None)
-    assert plots.angles.data is before
-    plots.visible = False
-    plots.follow(motion(seconds=9.0))
-    assert plots.angles.data is before
+    for motions in (motion(), None):
+        plots.follow(motions)
+        for plot in (plots.angles, plots.speeds):
+            assert {len(column) for column in plot.data} == {NUM_SAMPLES} and len(plot.data) == len(plot.series)
+        limits = sorted({column[0] for column in plots.angles.data[7:]})
+        finite = np.concatenate([limit[np.isfinite(limit)] for limit in (ROBOT.lower, ROBOT.upper)])
+        np.testing.assert_allclose(limits, np.sort(np.degrees(finite)))
+        assert (plots.speeds.data[7] == 100).all()
 
 
 def test_every_layer_has_a_checkbox():
@@ -388,16 +353,76 @@ def test_every_layer_has_a_checkbox():
     assert {*IN_SCENE, "joint_plots", "health_plots"} == switches | {"panels"}
 
 
-def test_a_joint_is_drawn_once_its_turn_is_seen(scene, robot):
-    arm, q, least = ArmPicture(scene, robot), robot.home + 0.3, SEEN / robot.levers
+# --- Rollouts as tubes, and what they cover ---
 
-    def drawn():
-        return np.array([frame.wxyz for frame in arm.frames[1:]])
+RADIUS, BALL = 0.003, 0.007
+SCENARIO = avoiding("draw_s", (Sphere((0.0, -0.5, 0.4)),))
 
-    for turned in (q, q + 1.1 * least):
-        arm.pose(turned)
-        np.testing.assert_allclose(drawn(), robot.joint_frames(turned), atol=1e-7)
-        arm.pose(turned + 0.9 * least)
-        np.testing.assert_allclose(drawn(), robot.joint_frames(turned), atol=1e-7)
-    arm.pose(turned + 2 * least * np.eye(6)[3])
-    np.testing.assert_allclose(drawn(), robot.joint_frames(turned + 2 * least * np.eye(6)[3]), atol=1e-7)
+
+def helix(turns, rise=0.3, samples=400):
+    angle = 2 * np.pi * turns * np.linspace(0, 1, samples)
+    return np.stack([0.1 * np.cos(angle), 0.1 * np.sin(angle), rise * np.linspace(0, 1, samples)], axis=1)
+
+
+PATHS = np.stack([evenly_bent(helix(turns), NUM_RINGS) for turns in (0.2, 1.0, 3.0)])
+
+
+def test_a_tube_lies_around_its_path_with_its_faces_outward():
+    vertices = tubes(PATHS, RADIUS, 0.0, NUM_SIDES)
+    for path, tube in zip(PATHS, vertices, strict=True):
+        np.testing.assert_allclose(np.linalg.norm(tube[1:-1] - path[:, None], axis=2), RADIUS, rtol=1e-5)
+        np.testing.assert_allclose(tube[[0, -1]], np.repeat(path[[0, -1], None], NUM_SIDES, axis=1), atol=1e-7)
+        mesh = trimesh.Trimesh(tube.reshape(-1, 3), tube_faces(1, *tube.shape[:2]))
+        mesh.merge_vertices()
+        mesh.update_faces(mesh.nondegenerate_faces())
+        length = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
+        assert mesh.is_volume
+        assert mesh.volume == pytest.approx(
+            NUM_SIDES / 2 * np.sin(2 * np.pi / NUM_SIDES) * RADIUS**2 * length, rel=0.02
+        )
+
+
+def test_rings_do_not_twist_from_one_to_the_next():
+    """A corner moves from ring to ring as far as the middle, and what the tangent's turn adds."""
+    corners = tubes(PATHS, RADIUS, 0.0, NUM_SIDES)[:, 1:-1]
+    steps = np.linalg.norm(np.diff(corners - PATHS[:, :, None], axis=1), axis=-1)
+    tangents = np.gradient(PATHS, axis=1)
+    tangents /= np.linalg.norm(tangents, axis=2, keepdims=True)
+    turns = np.linalg.norm(np.diff(tangents, axis=1), axis=-1)
+    assert (steps <= 1.1 * RADIUS * turns[..., None] + 1e-7).all()
+
+
+def test_a_ball_is_at_the_beginning():
+    globe = tubes(PATHS, RADIUS, BALL, NUM_SIDES)[:, : -NUM_RINGS - 1]
+    np.testing.assert_allclose(np.linalg.norm(globe - PATHS[:, :1, None], axis=-1), BALL, rtol=1e-5)
+    assert np.ptp(globe[:, :, 0] @ [0, 0, 1], axis=1).max() > 0.1 * BALL
+
+
+def test_points_are_denser_where_a_path_bends():
+    ends = np.array([[0.0, 0, 0], [0.5, 0, 0], [0.5, 0.5, 0]])
+    corner = np.concatenate([np.linspace(a, b, 100) for a, b in pairwise(ends)])
+    spacing = np.linalg.norm(np.diff(evenly_bent(corner, NUM_RINGS), axis=0), axis=1)
+    assert spacing.min() < 0.6 * spacing.max()
+    np.testing.assert_allclose(evenly_bent(np.zeros((4, 3)), NUM_RINGS), 0)
+
+
+def covering(*rollouts, **changes):
+    task = TASKS["draw_s"]()
+    return frame_of(SCENARIO, task=task, rollouts=rollouts, ghost=rollouts, chosen=0, **changes)
+
+
+def test_lines_are_drawn_only_beside_the_rollouts(scene):
+    task = TASKS["draw_s"]()
+    thin, dashed = demonstrations(scene), ghost(scene)
+    first = covering(*task.paths)
+    for picture in (thin, dashed):
+        picture.draw(first, Look(tubes=RolloutTubes(first.rollouts)))
+    assert len(thin.node.points) == len(dashed.node.points) == 0
+    aside = tuple(path + np.array([0.0, 0.02, 0.0]) for path in task.paths)
+    half = replace(first, rollouts=(*aside[:3], *task.paths[3:]))
+    thin.draw(half, Look(tubes=RolloutTubes(half.rollouts)))
+    middles = thin.node.points.mean(axis=1)
+    samples = np.concatenate([evenly_bent(path, NUM_RINGS) for path in half.rollouts])
+    assert len(middles) > 100 and KDTree(samples).query(middles)[0].min() > 0.99 * INSIDE
+    dashed.draw(first, Look(tubes=RolloutTubes(first.rollouts, shown=False)))
+    assert len(dashed.node.points) > 10  # nothing covers it any more

@@ -16,8 +16,8 @@ from dt_viz.obstacles import solids
 from dt_viz.obstacles.clouds import Cloud
 from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, MeshObstacle, Sphere, as_point, rotation
 from dt_viz.obstacles.solids import Solid
-from dt_viz.pictures.occupancy import occupancy_picture
 from dt_viz.pictures.sketchbook import Pictures
+from dt_viz.pictures.slice_fields import occupancy_picture
 from dt_viz.scenario.scenario import MAX_OBSTACLES, View
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui.scene.draggables import Obstacles, shaded
@@ -25,9 +25,10 @@ from dt_viz.ui.scene.markers import in_slice
 from dt_viz.ui.scene.picture import Look
 from dt_viz.ui.scene.slice_layers import OccupancySlice
 from dt_viz.ui.tabs.from_file import PLACED
-from dt_viz.ui.tabs.world import SHAPES, add, add_obstacles, delete, duplicate, name_of, with_room
+from dt_viz.ui.tabs.world import add, add_obstacles, delete, duplicate, name_of, offered, with_room
 from dt_viz.warning import Severity
 
+SHAPES = offered()
 BALL = Sphere((0.0, -0.5, 0.4), 0.12)
 BOX = Box((0.1, -0.5, 0.5), (0.2, 0.1, 0.06), (0.9, 0.1, 0.3, -0.3))
 TUBE = Cylinder((-0.1, -0.5, 0.3), 0.08, 0.2)
@@ -70,31 +71,6 @@ def test_the_scene_follows_the_scenario_whatever_comes_and_goes(shown):
             rounding = 0.04 * obstacle.size if is_rounded else 1e-6  # by two thirds of a cell of the distances
             np.testing.assert_allclose(obstacle.signed_distance(placed), 0, atol=rounding)
             assert item.node.disable_rotations == isinstance(obstacle, Sphere)
-
-
-def test_what_is_resized_is_not_sent_again(shown):
-    shown.adopt(scenario(MESH))
-    (item,) = shown.items
-    sent = item.mesh.vertices
-    shown.adopt(scenario(MESH.resized(0.2)))
-    assert item.mesh.vertices is sent
-    assert item.mesh.scale == pytest.approx(0.2 / 0.15)
-
-
-def test_what_another_thread_deletes_during_a_drag_is_moved_no_more(shown):
-    class Session:
-        left, edits, begin_gesture, end_gesture = [scenario(BALL), scenario()], [], ignored, ignored
-        scenario = property(lambda self: self.left.pop(0) if self.left[1:] else self.left[0])
-
-        def edit(self, gesture, **_changes):
-            self.edits.append(gesture)
-
-    session = Session()
-    shown._session = lambda: session
-    shown.adopt(scenario(BALL))
-    for phase in ("start", "update", "end"):
-        shown.moved(shown.items[0], np.array(BOX.position), np.array(BOX.wxyz), phase)
-    assert session.edits == ["obstacle 0"]
 
 
 @pytest.mark.parametrize(("selected", "expected"), [(0, [1, 0, 0]), (1, [0, 1, 0]), (2, [0, 0, 1]), (7, [0, 0, 1])])
@@ -151,7 +127,7 @@ def opened(server):
 
 
 def test_what_is_added_is_selected_stands_apart_and_is_a_step_for_undo(opened):
-    for number, shape in enumerate(SHAPES.values(), start=1):
+    for number, shape in enumerate([*SHAPES.values()][: MAX_OBSTACLES - 1], start=1):
         before = opened.session.scenario.obstacles
         add(opened.session, shape)
         *others, added = opened.session.scenario.obstacles
@@ -240,6 +216,7 @@ BAD = {
     "half.stl": (stl(BALL_MESH)[:3000], "a complete .stl file"),
     "tiny.stl": (stl(BALL_MESH.copy().apply_scale(1e-6)), "a largest side of 0.01 m to 1 m"),
     "what.txt": (b"?", "stl, obj, ply, glb, gltf, off, 3mf, npz, csv"),
+    "huge.csv": (b"ply\n" * (shapes.MAX_BYTES // 4 + 1), "file: found 20.0 MB; accepted: at most 20 MB"),
 }
 
 
@@ -252,13 +229,6 @@ def test_a_bad_file_is_refused_with_what_was_found_and_the_scene_stays(opened, n
     assert severity is Severity.ALARM and text.startswith(f"{name}: ") and "found " in text and "accepted: " in text
     assert words in text and not opened.files.again.visible
     assert opened.session.scenario == before and opened.session.steps == 0
-
-
-@pytest.mark.parametrize("suffix", ["stl", "csv"])
-def test_what_is_too_large_is_not_even_looked_at(opened, suffix, monkeypatch):
-    monkeypatch.setattr(shapes, "read_upload", None)
-    opened.files.load(b"ply\n" * (shapes.MAX_BYTES // 4 + 1), f"huge.{suffix}", 1.0)
-    assert opened.said == [(f"huge.{suffix}: file: found 20.0 MB; accepted: at most 20 MB", Severity.ALARM)]
 
 
 @pytest.mark.long
@@ -295,10 +265,6 @@ def test_large_meshes_are_drawn_with_fewer_triangles():
     vertices, faces = shaded(MeshObstacle((0.0, 0.0, 0.0), Solid(ball.vertices, ball.faces)))
     assert len(faces) < len(ball.faces) / 2
     assert np.abs(np.linalg.norm(vertices, axis=1) - 0.1).max() < 0.004
-
-
-def test_obstacles_are_called_by_number_and_shape():
-    assert [name_of(obstacle) for obstacle in (*ALL, SHAPES["Cube (fig. 3a)"])] == ["sphere", "box", "cylinder", "cube"]
 
 
 # --- The learned occupancy ---

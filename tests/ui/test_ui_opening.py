@@ -3,25 +3,26 @@
 import io
 import json
 import math
+import threading
 import zipfile
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 import viser  # noqa: TID251 - forges what a browser sends
-from pages import PATIENCE, Page, frame_of, wait_until
+from pages import PATIENCE, Page, frame_of
 
 import dt_viz as dt
-from dt_viz.files import uploads
+from dt_viz.errors import UnwantedError
 from dt_viz.files.npz import npz_bytes
 from dt_viz.files.values import packed
 from dt_viz.motion.stack import FINE
 from dt_viz.saving import SavedMotion, is_motion
 from dt_viz.scenario.tasks import TASKS
+from dt_viz.scheduler import Jobs
 from dt_viz.session.progress import Progress
-from dt_viz.session.session import CHOICES
-from dt_viz.ui.tabs.from_file import LANE
-from dt_viz.ui.tabs.opening import CHOOSING, SEEING
+from dt_viz.ui.tabs.from_file import LANE, turn
 
 RNG = np.random.default_rng(2)
 GOAL = np.array([0.2, -0.45, 0.3])
@@ -59,15 +60,11 @@ class Opening:
 
     def add(self, name, content):
         self.page.claim(self["Open a file, or drop it here"], viser.UploadedFile(name, content))
-        self.done()
+        self.page.settle()
 
     def choose(self, label, value):
         self.page.claim(self[label], value)
-        self.done()
-
-    def done(self):
-        for lane in (CHOOSING, LANE, SEEING, CHOICES):
-            assert self.page.session.jobs.wait_idle(lane, PATIENCE)
+        self.page.settle()
 
     @property
     def takes(self):
@@ -79,15 +76,10 @@ class Opening:
 
 
 @pytest.fixture(name="opened")
-def _opened(server, robot, monkeypatch):
-    monkeypatch.setattr(uploads, "_ready", uploads._Ready())
-    page, told = Page(server, robot), []
+def _opened(opened_for, monkeypatch):
+    page, told = opened_for(None), []
     monkeypatch.setattr(page.session, "say", lambda text, _severity: told.append(text))
-    opened = Opening(page, told)
-    yield opened
-    page.close()
-    server.gui.reset()
-    server.scene.reset()
+    return Opening(page, told)
 
 
 @pytest.mark.long
@@ -148,37 +140,26 @@ def test_a_click_learns_what_is_seen_and_undo_goes_back(opened):
     assert not opened.takes.visible
     session.undo()
     assert session.scenario.task == "draw_s" and dropdown.value == "Draw S"
-    session.redo()
-    assert dropdown.value == "Your data"
-    opened.choose("Task", "Draw J")
     opened.choose("Task", "Your data")
     assert session.scenario.task == task.name
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("name", "content", "said"),
-    [
-        ("a.exe", b"MZ", "a.exe"),
-        ("a.csv", b"t,x,y,z\n0,0,0,0\n1,nan,0,0\n", "nan"),
-    ],
-)
-def test_what_cannot_be_read_is_one_line_and_what_was_open_stays(opened, name, content, said):
-    opened.add("good.csv", csv())
-    opened.add(name, content)
-    assert len(opened.told) == 1 and said in opened.told[0] and "\n" not in opened.told[0]
-    assert opened.num_drawn == 1 and opened.takes.visible
-    opened.add("more.csv", csv())
-    assert opened.num_drawn == 2 and len(opened.told) == 1
-
-
-def test_more_than_a_visitor_may_hold_is_refused(opened):
-    opened.add("good.csv", csv())
-    opened.add("large.csv", bytes(50 * 10**6))
-    assert opened.told == [
-        "large.csv: files: found 50.0 MB in all; accepted: at most 50 MB; the command line takes more"
-    ]
-    assert opened.num_drawn == 1
+def test_what_cannot_be_read_is_one_line_and_what_was_open_stays(opened):
+    containers = opened.page.gui._container_handle_from_uuid.values()
+    (folder,) = (each for each in containers if getattr(each, "label", "") == "Your data")
+    too_large = "large.csv: files: found 50.0 MB in all; accepted: at most 50 MB; the command line takes more"
+    for num, name, content, said in (
+        (0, "a.csv", b"no numbers", "a: "),
+        (1, "a.exe", b"MZ", "a.exe"),
+        (2, "a.csv", b"t,x,y,z\n0,0,0,0\n1,nan,0,0\n", "nan"),
+        (3, "large.csv", bytes(50 * 10**6), too_large),
+    ):
+        opened.add(name, content)
+        assert said in opened.told.pop() and not opened.told and (not num or opened.num_drawn == num)
+        assert folder.visible is opened.takes.visible is (num > 0)
+        opened.add("good.csv", csv())
+        assert opened.num_drawn == num + 1 and not opened.told
 
 
 @pytest.mark.long
@@ -200,18 +181,7 @@ def test_what_is_not_clear_is_asked_for_and_answered(opened):
 
 
 @pytest.mark.long
-def test_three_columns_without_names_can_be_told(opened):
-    u = np.linspace(0, 1, 100)
-    rows = np.column_stack([0.3 * u, -0.5 + 0.1 * np.sin(3 * u), 0.3 + 0.1 * u**2])  # the first is as even as times are
-    opened.add("a.csv", "\n".join(",".join(f"{value:.6f}" for value in row) for row in rows).encode())
-    assert opened["First column"].value == "times" and "Rate" not in opened.labels()
-    opened.choose("First column", opened["First column"].options[1])
-    np.testing.assert_allclose(opened.takes.goal.position, rows[-1], atol=1e-4)
-    assert opened["Rate"].value == "20 Hz"
-
-
-@pytest.mark.long
-def test_several_goals_are_told_and_one_is_chosen(opened):
+def test_one_of_several_goals_a_scale_and_what_columns_without_names_are_can_be_chosen(opened):
     far = GOAL + np.array([0.0, 0.1, 0.3])
     opened.add("a.zip", zipped(a=csv(), b=csv(far), c=csv(), d=csv(far)))
     assert opened["Goal"].options[0].startswith("1 · ") and len(opened["Goal"].options) == 2
@@ -219,15 +189,20 @@ def test_several_goals_are_told_and_one_is_chosen(opened):
     opened.choose("Goal", opened["Goal"].options[1])
     np.testing.assert_allclose(opened.takes.goal.position, far, atol=0.01)
     assert opened.num_drawn == 2
-
-
-@pytest.mark.long
-def test_what_the_arm_cannot_reach_is_scaled_if_that_is_wanted(opened):
-    opened.add("a.zip", zipped(a=csv(3 * GOAL), b=csv(3 * GOAL)))
+    opened.choose("Cancel", True)
+    opened.add("a.zip", zipped(a=csv(3 * GOAL), b=csv(3 * GOAL)))  # out of reach
     assert opened["Scale to fit"].value is False
     opened.choose("Scale to fit", True)
     assert 0 < np.linalg.norm(opened.takes.goal.position) < 2 * np.linalg.norm(GOAL)
     assert opened["Scale to fit"].value is True
+    opened.choose("Cancel", True)
+    u = np.linspace(0, 1, 100)
+    rows = np.column_stack([0.3 * u, -0.5 + 0.1 * np.sin(3 * u), 0.3 + 0.1 * u**2])  # the first is as even as times are
+    opened.add("a.csv", "\n".join(",".join(f"{value:.6f}" for value in row) for row in rows).encode())
+    assert opened["First column"].value == "times" and "Rate" not in opened.labels()
+    opened.choose("First column", opened["First column"].options[1])
+    np.testing.assert_allclose(opened.takes.goal.position, rows[-1], atol=1e-4)
+    assert opened["Rate"].value == "20 Hz"
 
 
 @pytest.mark.long
@@ -243,7 +218,7 @@ def test_forged_values_are_refused(opened):
             before = handle.value
             for claim in (math.nan, -1, 2**70, None, "", "x" * 10_000, "1 · nobody", [], {}, True, 3.5):
                 opened.page.claim(handle, claim)
-                opened.done()
+                opened.page.settle()
                 assert handle.value == before, (handle.label, claim)
     hidden = [
         handle
@@ -253,28 +228,9 @@ def test_forged_values_are_refused(opened):
     for handle in hidden:
         before = handle.value
         opened.page.claim(handle, False)
-        opened.done()
+        opened.page.settle()
         assert handle.value == before and not handle.visible
     assert opened.num_drawn == 1 and opened.told == []
-
-
-def test_after_cancel_the_next_file_is_the_only_one(opened):
-    opened.add("a.csv", csv())
-    opened.choose("Cancel", True)
-    assert not opened.takes.visible
-    opened.add("b.csv", csv())
-    assert opened.takes.visible and opened.num_drawn == 1 and opened.takes.name.text == "b"
-
-
-@pytest.mark.long
-def test_the_folder_goes_again_with_a_first_file_that_cannot_be_read(opened):
-    opened.add("a.csv", b"no numbers")
-    assert len(opened.told) == 1 and opened.told[0].startswith("a: ")
-    containers = opened.page.gui._container_handle_from_uuid.values()
-    (folder,) = (each for each in containers if getattr(each, "label", "") == "Your data")
-    assert not folder.visible
-    opened.add("b.csv", csv())
-    assert folder.visible and opened.num_drawn == 1
 
 
 # --- motions that the library has saved ---
@@ -290,14 +246,6 @@ def arcs(dim=3):
 
 
 QUICK = dt.ImitationSettings(num_layers=2)
-MOTIONS = {
-    "in space": lambda: dt.fit([*arcs()], settings=QUICK, state="plain").stack(
-        dt.BiasPoint((0.0, -0.25, 0.3)), dt.Avoidance(dt.Sphere((-0.02, -0.31, 0.33), 0.08), margin=0.01)
-    ),
-    "augmented, with labels of its own": lambda: dt.fit([*arcs()], labels=[0, 1, 0, 1, 0, 1, 0]).stack(
-        dt.Avoidance(dt.Box((-0.02, -0.31, 0.33), (0.05, 0.1, 0.08)))
-    ),
-}
 
 
 def content_of(motion, folder):
@@ -306,15 +254,15 @@ def content_of(motion, folder):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", MOTIONS)
-def test_a_saved_motion_is_the_same_on_the_page(opened, tmp_path, new_engine, name):
-    motion = MOTIONS[name]()
+def test_a_saved_motion_is_the_same_on_the_page(opened, tmp_path, new_engine):
+    box = dt.Box((-0.02, -0.31, 0.33), (0.05, 0.1, 0.08))
+    motion = dt.fit([*arcs()], labels=[0, 1, 0, 1, 0, 1, 0]).stack(dt.Avoidance(box))
     opened.add("anything.bin", content_of(motion, tmp_path))
     session = opened.page.session
     assert opened.told == [] and len(session.task.demonstrations) == 7 and opened["Task"].value == "Your data"
     assert session.scenario.stack[0].transform == motion.transforms[0]
     engine = new_engine()
-    engine.bring(session.task, "draw_s")
+    engine.bring(session.task)
     solved = engine.solved(session.scenario, FINE)
     assert solved.stack.bundle.positions.tobytes() == motion.solution.bundle.positions.tobytes()
     session.undo()
@@ -322,42 +270,18 @@ def test_a_saved_motion_is_the_same_on_the_page(opened, tmp_path, new_engine, na
 
 
 @pytest.mark.long
-def test_a_saved_drawing_is_on_the_board_with_its_obstacles_and_without_any_it_has_the_sphere(opened, tmp_path):
-    box = dt.Box((0.0, -0.3, 0.0), (0.05, 0.1, 0.08))
-    plain = dt.fit([*arcs(2)], settings=QUICK, state="plain")
-    opened.add("a.npz", content_of(plain.stack(dt.Avoidance(box)), tmp_path))
-    session = opened.page.session
-    (there,) = session.scenario.obstacles
-    np.testing.assert_allclose(there.position, session.task.to_world(np.array([0.0, -0.3])))
-    assert session.task.draws
-    opened.add("b.npz", content_of(plain, tmp_path))
-    assert session.scenario.task == "own_data_2" and isinstance(session.scenario.obstacles[0], dt.Sphere)
-
-
-def refused_motions():
-    """Motions that are not read, by what is said of them."""
-    ball, plain = dt.Sphere((-0.02, -0.31, 0.33), 0.08), MOTIONS["in space"]()
-    slow = dt.AugmentedSettings(num_paces=10**7)
-    yield plain.stack(dt.Avoidance(ball)), "transforms 'Avoidance': found 2; accepted: at most 1"
-    saved = SavedMotion(tuple(arcs()), (), augmented=True, settings=slow)
-    yield saved, "settings of the augmented state: found others; accepted: the defaults on the page"
-    far = dt.Demonstration(np.arange(3.0), 1e3 * np.eye(3), "far")
-    yield SavedMotion((far,), (), augmented=True), "positions of 'far': found 1000 m"
-
-
-@pytest.mark.long
 def test_a_motion_that_is_not_read_is_one_line_and_changes_nothing(opened, tmp_path):
+    def forged(motion):
+        text = {"version": 1, **packed(motion, "motion", arrays := {})}
+        return npz_bytes({"motion": np.array(json.dumps(text))} | arrays)
+
     opened.add("good.csv", csv())
-    before, good = opened.page.session.scenario, content_of(MOTIONS["in space"](), tmp_path)
-    contents = []
-    for motion, said in refused_motions():
-        if isinstance(motion, SavedMotion):
-            text = {"version": 1, **packed(motion, "motion", arrays := {})}
-            contents.append((npz_bytes({"motion": np.array(json.dumps(text))} | arrays), said))
-        else:
-            contents.append((content_of(motion, tmp_path), said))
+    before, good = opened.page.session.scenario, content_of(dt.fit([*arcs(2)], settings=QUICK), tmp_path)
+    slow = SavedMotion(tuple(arcs()), (), augmented=True, settings=dt.AugmentedSettings(num_paces=10**7))
+    far = SavedMotion((dt.Demonstration(np.arange(3.0), 1e3 * np.eye(3), "far"),), (), augmented=True)
     for content, said in (
-        *contents,
+        (forged(slow), "settings of the augmented state: found others; accepted: the defaults on the page"),
+        (forged(far), "positions of 'far': found 1000 m"),
         (good[: len(good) // 2], "file: found something that cannot be read"),
         (npz_bytes({"motion": np.array("[" * 300_001)}), "array 'motion': found 300001 characters; accepted: at most"),
         (zipped(".npz", a=good, b=good), "a motion that the library has saved; accepted: recordings; this file is op"),
@@ -368,26 +292,46 @@ def test_a_motion_that_is_not_read_is_one_line_and_changes_nothing(opened, tmp_p
         assert opened.page.session.scenario is before and opened.num_drawn == 1
 
 
-@pytest.mark.long
-def test_another_task_ends_what_is_open(opened):
-    opened.add("a.csv", csv())
-    opened.choose("Task", "Draw J")
-    assert not opened.takes.visible and opened.page.session.scenario.task == "draw_j"
+# --- Files are read one at a time over all visitors ---
 
 
-@pytest.mark.long
-def test_two_visitors_open_at_the_same_instant_and_each_sees_its_own(robot, opened):
-    beside = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-    other = Page(beside, robot)
-    try:
-        label = "Open a file, or drop it here"
-        opened.page.claim(opened[label], viser.UploadedFile("a.csv", csv()))
-        other.claim(other[label], viser.UploadedFile("b.zip", zipped(b=csv(), c=csv())))
-        opened.done()
-        for lane in (CHOOSING, LANE, SEEING):
-            assert other.session.jobs.wait_idle(lane, PATIENCE)
-        wait_until(lambda: opened.takes.visible and other.visitor.pictures._takes.visible)
-        assert opened.takes.name.text == "a" and other.visitor.pictures._takes.name.text == "b"
-    finally:
-        other.close()
-        beside.stop()
+class Visitor:
+    """Has a file read that goes on until it is let go."""
+
+    def __init__(self) -> None:
+        self.waits, self.reads, self.let_go, self.done = (threading.Event() for _ in range(4))
+        self.errors: list[Exception] = []
+        self.jobs = Jobs(self.errors.append)
+        self.end = ""
+
+    def read(self) -> None:
+        try:
+            with turn(lambda *_said: self.waits.set(), partial(self.jobs.superseded, LANE)):
+                self.reads.set()
+                assert self.let_go.wait(PATIENCE)
+            self.end = "read"
+        except UnwantedError:
+            self.end = "left"
+            raise
+        finally:
+            self.done.set()
+
+
+@pytest.mark.parametrize("leaves", [None, 0, 1], ids=["nobody leaves", "who reads leaves", "who waits leaves"])
+def test_a_second_visitor_is_told_to_wait_and_comes_next_and_who_leaves_is_not_waited_for(leaves):
+    first, second = both = Visitor(), Visitor()
+    first.jobs.submit(LANE, first.read)
+    assert first.reads.wait(PATIENCE) and not first.waits.is_set()
+    second.jobs.submit(LANE, second.read)
+    assert second.waits.wait(PATIENCE) and not second.reads.wait(0.3)
+    if leaves is not None:
+        both[leaves].jobs.close()
+    if leaves == 1:
+        assert second.done.wait(PATIENCE) and second.end == "left" and not second.reads.is_set()
+    first.let_go.set()
+    assert first.done.wait(PATIENCE) and first.end == ("left" if leaves == 0 else "read")  # what was read is dropped
+    second.let_go.set()
+    assert second.done.wait(PATIENCE) and second.end == ("left" if leaves == 1 else "read")
+    assert first.errors == second.errors == []
+    first.jobs.close()
+    second.jobs.close()

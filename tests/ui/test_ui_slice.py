@@ -19,11 +19,10 @@ from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.frame import Stage
 from dt_viz.ui.scene.colour_scale import NUM_SHADES, from_oklab, oklab, ramp
 from dt_viz.ui.scene.draggables import MovableSlice, Obstacles
-from dt_viz.ui.scene.export import as_png
-from dt_viz.ui.scene.key import Key
+from dt_viz.ui.scene.export import as_png, explained
 from dt_viz.ui.scene.legend import OCCUPANCY, drawn_onto, legend_of
 from dt_viz.ui.scene.palette import LIGHT, css
-from dt_viz.ui.scene.picture import Look
+from dt_viz.ui.scene.picture import Key, Look
 from dt_viz.ui.scene.rollouts import Rollouts
 from dt_viz.ui.scene.slice_layers import (
     OPACITY,
@@ -238,8 +237,8 @@ def test_a_saved_picture_has_the_legend_in_its_corner_and_nothing_else_is_change
 def test_a_saved_picture_is_white_behind_or_transparent():
     blank = Image.new("RGBA", (320, 180))
     for legends in ([], [OCCUPANCY]):
-        white = Image.open(io.BytesIO(as_png(blank, legends, transparent=False)))
-        clear = Image.open(io.BytesIO(as_png(blank, legends, transparent=True)))
+        white = Image.open(io.BytesIO(as_png(explained(blank, legends, transparent=False))))
+        clear = Image.open(io.BytesIO(as_png(explained(blank, legends, transparent=True))))
         assert (white.mode, clear.mode) == ("RGB", "RGBA")
         assert white.getpixel((300, 10)) == (255, 255, 255) and clear.getpixel((300, 10)) == (0, 0, 0, 0)
         assert (np.asarray(white).min() < 255) == bool(legends)

@@ -1,26 +1,33 @@
-"""What the page shows of bias points, the stack and pots, without a browser."""
+"""What the page shows of bias points, the stack, its settings and the warp, without a browser."""
 
+import itertools
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
-from pages import Bound, Edited, frame_of, ignored
-from scenes import avoiding, beside, biases, changed
+from pages import Bound, Edited, NoFrames, frame_of, ignored, wait_until
+from scenes import avoiding, beside, biases, changed, changing
 
 from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.avoidance.registry import BIAS
+from dt_viz.flows.diffeomorphisms import Integration
 from dt_viz.obstacles.shapes import Sphere
-from dt_viz.scenario.panels import BASE_PANEL
 from dt_viz.scenario.scenario import Scenario, View
+from dt_viz.scenario.slices import BASE_PANEL
 from dt_viz.scenario.stack import IMITATION, WHOLE_ARM, anchored, avoiding_with, selected
 from dt_viz.scenario.tasks import TASKS
+from dt_viz.session import player as player_module
+from dt_viz.session.engine import Engine
+from dt_viz.session.session import Session
 from dt_viz.ui.panel import add_avoid_and_imitate, avoids_with
 from dt_viz.ui.scene.draggables import BiasPoints
 from dt_viz.ui.scene.picture import Look
 from dt_viz.ui.scene.rollouts import LevelRollouts
 from dt_viz.ui.scene.tubes import NUM_SIDES
+from dt_viz.ui.tabs import stack as stack_module
 from dt_viz.ui.tabs.stack import (
     BASE,
     DOWN,
@@ -30,7 +37,10 @@ from dt_viz.ui.tabs.stack import (
     SHOWN,
     UP,
     StackPanel,
+    add_transform_settings,
     formula_html,
+    grown,
+    learned_html,
     legend_html,
     press,
     rows,
@@ -53,6 +63,7 @@ def frame(scenario=SCENARIO, **changes):
         "goal": np.zeros(3),
         "levels": tuple((np.full((5, 3), float(k)),) for k in range(4)),
         "durations": {"Bias 1": 0.8, AVOIDANCE: 0.4},
+        "learned_steps": (4, 4, 4),
         "chosen_values": {"Bias 1": {"strength": 0.8, "radius": 0.2}, AVOIDANCE: {"duration": 0.4}},
     }
     return frame_of(scenario, **(given | changes))
@@ -143,13 +154,6 @@ def test_the_selected_level_is_drawn_and_named(scene):
         np.testing.assert_allclose(middles[-1], level, atol=1e-6)
     picture.draw(frame(), Look())
     assert not picture.visible
-
-
-def test_without_imitation_the_lowest_level_is_called_what_it_is():
-    seen = replace(SCENARIO, view=View(level=IMITATION))
-    assert "manifold of the imitation" in legend_html(seen)
-    without = legend_html(replace(seen, imitation=False))
-    assert "base attractor: straight motions" in without and "of the imitation" not in without
 
 
 def test_the_end_of_a_level_is_marked_where_it_is_not_the_goal(scene):
@@ -272,3 +276,153 @@ def test_imitation_is_switched_where_it_is_seen_first(bound):
         bound.set("Imitate", on)
         assert bound.edited.scenario == replace(SCENARIO, imitation=on)
         assert bound["Imitate"].control.value is on
+
+
+# --- The settings of the transforms, and the warp ---
+
+
+@pytest.fixture
+def notes():
+    """HTML elements of the settings."""
+    return []
+
+
+@pytest.fixture
+def controls(server, notes, monkeypatch):
+    add_html = server.gui.add_html
+    monkeypatch.setattr(server.gui, "add_html", lambda *what, **how: notes.append(add_html(*what, **how)) or notes[-1])
+    bound = Bound(SCENARIO)
+    add_transform_settings(server.gui, bound, 0)
+    bound.adopt(SCENARIO)
+    yield bound
+    server.gui.reset()
+
+
+def visible(bound):
+    return {item.control.handle.label for item in bound.inputs(visible=True)}
+
+
+STRENGTH = {"Settings of", "Strength: auto", "Strength t", "Integrator"}
+FLOW = {"Settings of", "Flow time: auto", "Flow time t", "Integrator"}
+
+
+def test_only_what_the_chosen_transform_has_is_shown(controls):
+    assert visible(controls) == FLOW | {"Generator", "Temperature T"}  # the outermost is the avoidance
+    controls.set("Settings of", "Bias 1")
+    assert visible(controls) == STRENGTH  # as the paper calls the t of a bias point
+    controls.set("Integrator", "Euler (the paper's)")
+    assert visible(controls) == STRENGTH | {"Steps"}
+    controls.set("Settings of", AVOIDANCE)
+    assert visible(controls) == FLOW | {"Generator", "Temperature T"}
+    controls.set("Settings of", IMITATION)
+    assert visible(controls) == {"Settings of", "Objective", "State"}
+
+
+def test_settings_change_the_transform_that_they_are_shown_for(controls):
+    controls.set("Settings of", "Bias 1")
+    controls.set("Integrator", "Euler (the paper's)")
+    controls.set("Steps", 3)
+    assert cast(BiasPoint, anchored(controls.edited.scenario)["Bias 1"]).integration == Integration("euler", 3)
+    assert controls.edited.scenario.avoidance == SCENARIO.avoidance
+    controls.set("Settings of", AVOIDANCE)
+    assert (controls["Integrator"].control.value, controls.inputs("Steps", visible=True)) == ("auto", [])
+    controls.set("Temperature T", 9.0)
+    assert controls.edited.scenario.avoidance.temperature == 9.0
+
+
+def test_a_duration_by_hand_goes_on_from_what_auto_chose(controls):
+    for name, label, chosen in ((AVOIDANCE, "Flow time", 0.4), ("Bias 1", "Strength", 0.8)):
+        controls.set("Settings of", name)
+        controls.report(frame(controls.edited.scenario))
+        slider, before = controls[f"{label} t"].control, controls.edited.scenario
+        assert slider.handle.disabled and slider.value == chosen
+        controls.set(f"{label} t", 1.5)
+        assert controls.edited.scenario == before  # it is `auto` that chooses
+        controls.set(f"{label}: auto", False)
+        assert not slider.handle.disabled and slider.value == chosen
+        controls.set(f"{label} t", 1.5)
+    assert controls.edited.scenario.avoidance.duration == 1.5
+    assert cast(BiasPoint, anchored(controls.edited.scenario)["Bias 1"]).strength == 1.5
+    controls.set("Strength: auto", True)
+    assert cast(BiasPoint, anchored(controls.edited.scenario)["Bias 1"]).strength is None
+
+
+def test_the_imitation_says_what_it_is_made_of_and_why_there_is_nothing_to_choose(controls, notes):
+    (note,) = notes
+    controls.report(frame())
+    assert not note.visible
+    controls.set("Settings of", IMITATION)
+    assert note.visible and "3 flows of 4 Euler steps" in note.content and "nothing to choose" in note.content
+    assert "One flow of 12 Euler steps" in learned_html(frame(learned_steps=(12,)))
+    assert "straight" in learned_html(None)
+    remembering = learned_html(frame(learned_steps=(), remembers=True, reason="they cross"))
+    assert "Chosen because they cross" in remembering and "remembers its phase" in remembering
+
+
+# --- The warp ---
+
+
+class Quiet:
+    """A display that shows nothing."""
+
+    def __getattr__(self, name):
+        return lambda *_: None
+
+
+@pytest.fixture
+def played():
+    played = Session(cast(Engine, NoFrames()), lambda *_: SCENARIO, "draw_s", cast(Any, Quiet()))
+    yield played
+    played.close()
+
+
+def play_warp(played, told, seconds, monkeypatch):
+    monkeypatch.setattr(stack_module, "SECONDS", seconds)
+    player_module.start(played, "Warp", grown, told.append)
+
+
+def plays(played):
+    return played.jobs.busy(player_module.LANE)
+
+
+def test_playing_goes_from_straight_rays_to_the_full_stack_as_one_step_for_undo(played, monkeypatch):
+    edit = played.edit
+    played.edit("Warp", warp=0.7)
+    played.end_gesture()
+    told, clock = [], itertools.count()
+    monkeypatch.setattr(player_module, "time", SimpleNamespace(monotonic=lambda: 0.03 * next(clock)))
+    warps = []
+    monkeypatch.setattr(played, "edit", lambda name, warp: warps.append(warp) or edit(name, warp=warp))
+    play_warp(played, told, 0.3, monkeypatch)
+    wait_until(lambda: told == [True, False])
+    assert warps == sorted(warps) and warps[0] < 0.3 and warps[-1] == 1
+    assert played.scenario == SCENARIO
+    played.undo()
+    assert played.scenario.warp == 0.7
+    played.undo()
+    assert played.scenario == SCENARIO
+
+
+def test_playing_stops_when_it_is_told_to_or_something_else_is_moved(played, monkeypatch):
+    told = []
+    play_warp(played, told, 1000.0, monkeypatch)
+    wait_until(lambda: played.scenario.warp < 0.5)
+    played.edit("view", view=View(grid=True))  # moves nothing
+    assert plays(played)
+    player_module.stop(played)
+    wait_until(lambda: not plays(played))
+    assert told == [True, False]
+    player_module.start(played, "Warp", grown, told.append)
+    wait_until(lambda: told == [True, False, True])
+    played.edit("obstacle", **changing(played.scenario, obstacles=(), warp=0.9))
+    wait_until(lambda: not plays(played))
+    assert played.scenario.warp == 0.9
+
+
+def test_of_two_things_that_are_played_the_second_ends_the_first(played, monkeypatch):
+    told = {"warp": [], "other": []}
+    play_warp(played, told["warp"], 1000.0, monkeypatch)
+    wait_until(lambda: told["warp"] == [True])
+    player_module.start(played, "Other", lambda _scenario, _seconds: None, told["other"].append)
+    wait_until(lambda: not plays(played))
+    assert told == {"warp": [True, False], "other": [True, False]}

@@ -1,6 +1,6 @@
 """The dark theme: what is drawn on it can be seen, and the light one comes back as it was."""
 
-from dataclasses import fields
+import re
 
 import numpy as np
 import pytest
@@ -8,13 +8,14 @@ from scipy.spatial.transform import Rotation
 
 from dt_viz.session.frame import Stage
 from dt_viz.session.progress import Pace
-from dt_viz.ui.scene.palette import DARK, Theme
+from dt_viz.ui.scene import palette
+from dt_viz.ui.scene.export import Order
+from dt_viz.ui.scene.palette import DARK
 from dt_viz.ui.scene.stage import background
-from dt_viz.ui.scene.style import STYLES, Style
+from dt_viz.ui.tabs.about import LEGEND, legend_html
 
 LINES = ("demonstration", "rollout", "added", "ghost", "way", "goal", "obstacle", "bias", "streamline", "arrow_fast")
-SEEN = 2.7
-"""Smallest contrast with table and sky (WCAG 2.1 measures it so)."""
+SEEN = 2.7  # smallest contrast with table and sky (WCAG 2.1 measures it so)
 
 
 def luminance(colour):
@@ -31,12 +32,6 @@ def contrast(one, other):
 def test_lines_are_seen_on_the_dark_background(name):
     for ground in (DARK.zenith, DARK.horizon, DARK.table):
         assert contrast(getattr(DARK, name), ground) >= SEEN
-
-
-def test_each_style_has_colours_that_all_themes_have():
-    names = {field.name for field in fields(Theme)}
-    for style in (style for style in vars(STYLES).values() if isinstance(style, Style)):
-        assert {value for value in vars(style).values() if isinstance(value, str)} <= names | {""}
 
 
 def colours(page):
@@ -78,12 +73,12 @@ def test_a_picture_is_saved_in_light_colours_and_the_dark_theme_stays(page, monk
 
     monkeypatch.setattr(page.scene, "set_background_image", lambda image, *_: grounds.append(image))
 
-    def render(*_size, **_how):
+    def render(height, width, **_how):
         taken.append((colours(page), grounds[-1]))
-        return np.zeros((2, 2, 4), np.uint8)
+        return np.zeros((height, width, 4), np.uint8)
 
     monkeypatch.setattr(page.client, "get_render", render)
-    page.visitor.render((1280, 720))
+    page.visitor.picture(Order(".png"))
     assert taken == [(light, None)] and colours(page) == dark != light
     assert np.array_equal(grounds[-1], background(DARK))
     choose(page, False)
@@ -91,8 +86,13 @@ def test_a_picture_is_saved_in_light_colours_and_the_dark_theme_stays(page, monk
 
 def test_a_picture_by_itself_looks_as_a_saved_camera_beside_the_panel(page, monkeypatch):
     shots, (position, look_at) = [], np.array([[1.0, -2.0, 1.5], [0.1, -0.3, 0.2]])
-    monkeypatch.setattr(page.client, "get_render", lambda *_size, **how: shots.append(how) or np.zeros((2, 2, 4), "u1"))
-    page.visitor.render_alone((1280, 720), 1.0, (tuple(position), tuple(look_at)))
+
+    def render(height, width, **how):
+        shots.append(how)
+        return np.zeros((height, width, 4), np.uint8)
+
+    monkeypatch.setattr(page.client, "get_render", render)
+    page.visitor.picture(Order(".png", alone=True, sight=(tuple(position), tuple(look_at))))
     (shot,) = shots
     right, _down, ahead = Rotation.from_quat(np.roll(shot["wxyz"], -1)).as_matrix().T
     depth = np.linalg.norm(look_at - position)
@@ -100,3 +100,13 @@ def test_a_picture_by_itself_looks_as_a_saved_camera_beside_the_panel(page, monk
     offset = shot["position"] - position
     np.testing.assert_allclose(offset, (offset @ right) * right, atol=1e-9)
     assert -0.3 * depth < offset @ right < 0
+
+
+# --- The foot of the panel ---
+
+
+def test_the_legend_has_each_colour_that_is_drawn_once():
+    colours = re.findall(r"background:(rgb[^']*)'", legend_html())
+    assert colours == [palette.css(colour) for colour in LEGEND.values()] and len(set(colours)) == len(colours)
+    wanted = {"demonstration", "rollout", "ghost", "obstacle", "goal", "way"}
+    assert {getattr(palette.LIGHT, name) for name in wanted} <= set(LEGEND.values())

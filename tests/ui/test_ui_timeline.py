@@ -2,16 +2,15 @@
 
 import math
 import re
-import threading
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from pages import all_of, frame_of, ignored, wait_until
+from pages import all_of, frame_of, wait_until
 
 from dt_viz.motion.following import ArmMotion
 from dt_viz.scenario.scenario import View
-from dt_viz.session.recording import Recording
+from dt_viz.ui.playback import Recording
 from dt_viz.ui.tabs.plots import cursor_html, place_along
 from dt_viz.ui.tabs.timeline import BACK, LIVE, ON, PAST, PAUSE, PLAY, REPLAY
 
@@ -197,58 +196,29 @@ def test_plots_are_marked_at_the_moment_that_is_shown(watched):
 
 
 def test_large_plots_are_in_windows_in_place_of_the_tab(watched):
-    plots, edit = watched.page.visitor._panel.show.plots, watched.page.session.edit
-    for view, joints, health in (
-        (View(), [], []),
-        (View(joint_plots=True), [False], []),
-        (View(joint_plots=True, large_plots=True), [True], []),
-        (View(health_plots=True, large_plots=True), [], [True]),
-    ):
-        edit("test", view=view)
-        assert [large for large, shown in zip((False, True), plots.joints, strict=True) if shown.visible] == joints
-        assert [large for large, shown in zip((False, True), plots.health, strict=True) if shown.visible] == health
-
-
-def test_large_plots_of_compared_methods_are_in_a_window_in_place_of_the_tab(watched):
-    gui, edit = watched.page.gui, watched.page.session.edit
+    plots, gui = watched.page.visitor._panel.show.plots, watched.page.gui
     boxes = [handle for handle in watched.page.inputs if handle.label == "Large plots"]
+    num_others = sum(panel.visible for panel in gui._panel_handle_from_uuid.values())
 
-    def windows():
-        return [panel._tab_labels for panel in gui._panel_handle_from_uuid.values() if panel.visible]
+    def large_of(shown):
+        return [large for large, each in zip((False, True), shown, strict=True) if each.visible]
 
-    for view, seen in (
-        (View(compared=("linear",)), []),
-        (View(compared=("linear",), large_plots=True), [("Along the path (fig. 6)",)]),
-        (View(large_plots=True), []),
+    for view, joints, health, num_windows in (
+        (View(), [], [], 0),
+        (View(joint_plots=True), [False], [], 0),
+        (View(joint_plots=True, large_plots=True), [True], [], 1),
+        (View(health_plots=True, large_plots=True), [], [True], 1),
+        (View(compared=("linear",)), [], [], 0),
+        (View(compared=("linear",), large_plots=True), [], [], 1),  # along the path (fig. 6)
+        (View(large_plots=True), [], [], 0),
     ):
-        edit("test", view=view)
-        assert windows() == seen
-        assert sum(box.visible for box in boxes) == bool(view.compared)
+        watched.page.session.edit("test", view=view)
+        assert (large_of(plots.joints), large_of(plots.health)) == (joints, health)
+        assert sum(panel.visible for panel in gui._panel_handle_from_uuid.values()) == num_others + num_windows
+        assert sum(box.visible for box in boxes) == bool(view.compared) + bool(view.joint_plots or view.health_plots)
 
 
 def test_a_place_is_marked_where_the_path_is_nearest():
     path = np.array([[0.0, 0, 0], [1, 0, 0], [1, 3, 0]])
     assert [place_along(path, np.array(place)) for place in ((-1, 0, 0), (1.2, 0.1, 0), (1, 9, 9))] == [0.0, 0.25, 1.0]
     assert "path" not in cursor_html(time=0.5, path=None)
-
-
-def test_a_frame_of_another_task_waits_while_the_arm_is_moved(page, monkeypatch):
-    """What the hand carries would be taken from the scene while it is moved."""
-    visitor, frame, order, drawing = page.visitor, frame_of(page.session.scenario, task=page.session.task), [], []
-    monkeypatch.setattr(visitor.pictures, "draw", lambda _frame: order.append("scene"))
-    monkeypatch.setattr(visitor.robot, "draw", lambda *_what: order.append("arm"))
-    monkeypatch.setattr(visitor._panel, "report", ignored)
-    monkeypatch.setattr(visitor, "shown", frame)
-
-    def pose(_now, _tubes):
-        if not drawing:
-            drawing.append(threading.Thread(target=visitor._draw, args=(frame,)))
-            drawing[0].start()
-            wait_until(lambda: order)
-            drawing[0].join(0.1)
-            order.append("posed")
-
-    monkeypatch.setattr(visitor.robot, "pose", pose)
-    visitor._pose()
-    drawing[0].join()
-    assert order == ["scene", "posed", "arm"]

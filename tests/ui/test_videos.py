@@ -2,8 +2,8 @@
 
 import sys
 import threading
-import time
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from dt_viz.obstacles.shapes import rotation
 from dt_viz.session.frame import Stage
 from dt_viz.session.progress import Pace
 from dt_viz.ui.scene.camera import TURN, shot_of
-from dt_viz.ui.scene.film import MOTION, TURNTABLE, WARP, FilmSettings
+from dt_viz.ui.scene.export import MOTION, TURNTABLE, WARP, FilmSettings
 from dt_viz.ui.scene.palette import DARK, LIGHT
 
 SHORT = FilmSettings(rate=5, motion=1.0, turn=2.0, warp=0.8, rest=0.4)
@@ -45,16 +45,6 @@ class Camera:
         return np.array([frame.wxyz for frame in arms]), handles
 
 
-class Filmed(Page):
-    """A page whose videos are rendered by a camera, and kept in a file."""
-
-    def __init__(self, server, robot, file):
-        super().__init__(server, robot)
-        self.sent, self.browser, self.file = [], Camera(self), file
-        self.client.send_file_download = lambda name, content, **_how: self.sent.append((name, content))
-        self.client.get_render = self.browser.get_render
-
-
 @pytest.fixture(scope="module")
 def frame(at_rest, initial):
     return at_rest(initial("draw_s"), Stage.CERTIFIED)
@@ -63,11 +53,14 @@ def frame(at_rest, initial):
 @pytest.fixture
 def filming(server, robot, frame, engine, monkeypatch, tmp_path):
     """A page that shows a motion, held at a moment of it, and what renders it."""
-    for module in ("visitor", "scene.film"):
+    for module in ("visitor", "scene.export"):
         monkeypatch.setattr(f"dt_viz.ui.{module}.SETTINGS", SHORT)
     fine = lambda _self, scenario, cancelled: engine.fine(scenario, cancelled)  # noqa: E731
     monkeypatch.setattr(NoFrames, "fine", fine, raising=False)
-    page = Filmed(server, robot, tmp_path / "video")
+    page: Any = Page(server, robot)
+    page.sent, page.browser, page.file = [], Camera(page), tmp_path / "video"
+    page.client.send_file_download = lambda name, content, **_how: page.sent.append((name, content))
+    page.client.get_render = page.browser.get_render
     view = replace(frame.scenario.view, replay=True, handles=True)
     page.session.edit("test", **all_of(replace(frame.scenario, view=view)))
     visitor = page.visitor
@@ -128,8 +121,12 @@ def as_before(page, before):
 @pytest.mark.parametrize("suffix", [".mp4", ".gif"])
 def test_a_motion_goes_from_its_start_to_its_goal_and_rests(filming, frame, robot, suffix):
     before = state(filming)
-    told, frames = decoded(save(filming, MOTION, suffix))
+    told, frames = decoded(file := save(filming, MOTION, suffix))
     assert f"{SHORT.rate} fps" in told and frames.shape[1:] == (SIZE[1], SIZE[0], 3)
+    if suffix == ".mp4":  # slide programs play it
+        content = file.read_bytes()
+        assert "Video: h264" in told and "yuv420p(tv, bt709" in told
+        assert content.index(b"moov") < content.index(b"mdat")
     assert len(filming.browser.seen) == 6 and len(frames) == 6 + 2
     joints, handles = zip(*filming.browser.seen, strict=True)
     for k, part in enumerate(np.linspace(0, 1, 6)):
@@ -142,13 +139,6 @@ def test_a_motion_goes_from_its_start_to_its_goal_and_rests(filming, frame, robo
     np.testing.assert_allclose(middles[6:], middles[[5, 5]], atol=2)
     assert frames[:, 600, 1000].min() > 250  # what is transparent is white
     as_before(filming, before)
-
-
-def test_an_mp4_plays_in_slide_programs(filming):
-    file = save(filming, MOTION)
-    content, (told, _) = file.read_bytes(), decoded(file)
-    assert "Video: h264" in told and "yuv420p(tv, bt709" in told
-    assert content.index(b"moov") < content.index(b"mdat")
 
 
 def test_a_turntable_goes_around_the_middle_once(filming):
@@ -237,7 +227,7 @@ def test_what_moves_waits_and_the_theme_that_is_chosen_comes_afterwards(filming,
     clock, place = visitor.robot.playback.replay.clock, np.array(filming.camera.position)
     filming.claim(filming["Dark theme"], True)
     filming.done()
-    time.sleep(1.0)
+    visitor.robot.playback.advance(1.0)
     assert visitor.pictures._theme is LIGHT and visitor._studio.theme is DARK
     assert visitor.robot.playback.replay.clock == clock and np.array_equal(filming.camera.position, place)
     browser.goes_on.set()
@@ -251,34 +241,37 @@ def test_what_moves_waits_and_the_theme_that_is_chosen_comes_afterwards(filming,
     filming.done()
 
 
-@pytest.mark.parametrize("why", ["no answer", "another size", "no picture", "no ffmpeg", "broken ffmpeg", "no motion"])
+WRONG = {
+    "no answer": "the browser, its page out of sight perhaps, drew nothing within 0.3 s",
+    "another size": "the browser: found a PNG of 8x8 pixels; accepted: an RGBA PNG of 1280x720 pixels",
+    "no picture": "the browser: found no PNG",
+    "no ffmpeg": "ffmpeg: found not installed; accepted: pip install 'dt-viz[video]'",
+    "broken ffmpeg": "ffmpeg: found a failure (no such codec)",
+    "no motion": "the motion: found none that the arm follows",
+}
+
+
+@pytest.mark.parametrize("why", WRONG)
 def test_what_goes_wrong_is_said_in_a_line_and_nothing_stays(filming, frame, why, monkeypatch, tmp_path):
     browser, before = filming.browser, state(filming)
     if why == "no answer":
-        short = replace(SHORT, patience=0.3)
-        for module in ("visitor", "scene.film"):
-            monkeypatch.setattr(f"dt_viz.ui.{module}.SETTINGS", short)
+        for module in ("visitor", "scene.export"):
+            monkeypatch.setattr(f"dt_viz.ui.{module}.SETTINGS", replace(SHORT, patience=0.3))
         browser.goes_on.clear()
-        said = "Save video: the browser, its page out of sight perhaps, drew nothing within 0.3 s"
     elif why == "another size":
         browser.size = 8, 8
-        said = "Save video: the browser: found a picture of shape (8, 8, 4); accepted: 1280x720 pixels"
     elif why == "no picture":
-        monkeypatch.setattr(filming.client, "get_render", lambda *_size, **_how: exec("raise RuntimeError"))
-        said = "Save video: the browser: found no picture"
+        monkeypatch.setattr(filming.client, "get_render", lambda *_size, **_how: b"")  # as viser's page has failed
     elif why == "no ffmpeg":
         monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-        said = "Save video: ffmpeg: found not installed; accepted: pip install 'dt-viz[video]'"
     elif why == "broken ffmpeg":
         (tmp_path / "ffmpeg").write_text("#!/bin/sh\necho no such codec >&2\nexit 1\n")
         (tmp_path / "ffmpeg").chmod(0o755)
-        monkeypatch.setattr("dt_viz.pictures.video._ffmpeg", lambda: str(tmp_path / "ffmpeg"))
-        said = "Save video: ffmpeg: found a failure (no such codec)"
+        monkeypatch.setattr("dt_viz.pictures.video.ffmpeg", lambda: str(tmp_path / "ffmpeg"))
     else:
         filming.visitor.shown = replace(frame, arm=None)
-        said = "Save video: the motion: found none that the arm follows"
     text = save(filming, MOTION)
-    assert isinstance(text, str) and text.startswith(said) and "\n" not in text
+    assert isinstance(text, str) and text.startswith(f"Save video: {WRONG[why]}") and "\n" not in text
     filming.visitor.shown = frame
     as_before(filming, before)
     browser.goes_on.set()

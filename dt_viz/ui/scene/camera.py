@@ -14,37 +14,32 @@ import viser
 from viser.transforms import SO3
 
 from dt_viz.flows.fields import Array
-from dt_viz.scenario.panels import TITLE_ROOM, directions
 from dt_viz.scenario.scenario import MAX_SIGHT
-from dt_viz.scenario.slices import Slice
+from dt_viz.scenario.slices import TITLE_ROOM, Slice, directions
 from dt_viz.scenario.tasks import Task
-from dt_viz.ui import gestures
 
 HOME, HAND = "Home", "Hand"
 """Names of the views from the task's own direction: of all of it, and of the hand, from near."""
-VIEWS = {"Front": (0.0, 1.0, -0.12), "Side": (-1.0, 0.12, -0.12), "Top": (0.0, 0.02, -1.0)}
+OFF_VERTICAL = 0.02  # slope from the vertical of a view from above
+VIEWS = {"Front": (0.0, 1.0, -0.12), "Side": (-1.0, 0.12, -0.12), "Top": (0.0, OFF_VERTICAL, -1.0)}
 """Directions of sight, by name."""
 
 MOVED = 1e-3
 """Distance of the camera from where it was put, metres, from which on the visitor has moved it."""
-TURN = 2 * np.pi / 90
-"""Angular velocity of the orbit, rad/s."""
-PAUSE = 1.5
-"""Time without a move of the visitor's after which the orbit goes on, seconds."""
+TURN = 2 * np.pi / 90  # angular velocity of the orbit, rad/s
+PAUSE = 1.5  # time without a move of the visitor's after which the orbit goes on, seconds
+LOWEST, STEEPEST, TILT = 0.1, np.pi / 3, np.pi / 90
+"""Height over the table that a view begins at, metres, its steepest pitch for that, and the steps to it, rad."""
 
-Pose = tuple[Array, Array]
-"""Position (3,) and look-at (3,) of a camera, metres."""
+Pose = tuple[Array, Array]  # position (3,) and look-at (3,) of a camera, metres
 
 
 class Shot(NamedTuple):
     """The camera of a picture."""
 
-    wxyz: Array
-    """(4,) quaternion: x to the right, y down, z ahead."""
-    position: Array
-    """(3,), metres."""
-    fov: float
-    """Vertical field of view, rad."""
+    wxyz: Array  # (4,) quaternion: x to the right, y down, z ahead
+    position: Array  # (3,), metres
+    fov: float  # vertical field of view, rad
 
 
 @dataclass(frozen=True)
@@ -53,22 +48,15 @@ class Framing:
 
     size: tuple[int, int] = (1280, 720)
     """Width and height of the window, CSS pixels; these where they are not known."""
-    panel: float = 350.0
-    """Width of the panel and its margins, CSS pixels."""
-    alone: bool = False
-    """Whether there is a caption instead of the panel, as in a presentation."""
+    panel: float = 350.0  # width of the panel and its margins, CSS pixels
+    alone: bool = False  # whether there is a caption instead of the panel, as in a presentation
     narrow: int = 577
     """Width of a window, CSS pixels, below which viser puts the panel under the scene, not beside it: 36 em."""
-    under: float = 0.6
-    """Part of a narrow window's height that the panel takes."""
-    caption: float = 0.2
-    """Part of a window's height that the caption takes."""
-    margin: float = 0.06
-    """Part of the free window that stays empty on each side."""
-    field_of_view: float = 0.75
-    """Vertical field of view, rad."""
-    arm_size: float = 1.0
-    """Reach of the arm that is to be seen, relative to the JACO's."""
+    under: float = 0.6  # part of a narrow window's height that the panel takes
+    caption: float = 0.2  # part of a window's height that the caption takes
+    margin: float = 0.06  # part of the free window that stays empty on each side
+    field_of_view: float = 0.75  # vertical field of view, rad
+    arm_size: float = 1.0  # reach of the arm that is to be seen, relative to the JACO's
 
     @property
     def free(self) -> tuple[Array, Array]:
@@ -93,15 +81,18 @@ class Framing:
 def window_size(camera: Any, width: float | None = None) -> tuple[int, int]:  # noqa: ANN401
     """Return width and height of the window of viser's camera, CSS pixels, as the browser told, if it can be.
 
-    The camera's picture has their ratio only: it is as large only while a CSS pixel is a pixel of the picture.
+    The camera's picture has their ratio only: it is as large only while a CSS pixel is a pixel of the picture. A
+    window that is higher than wide is a phone's until its width is known.
 
     Args:
         camera: viser's.
         width: the window's width, as of a `Ruler`; None if that is not known.
     """
-    size = gestures.vector((camera.image_width, camera.image_height), 2, 20_000)
-    if size is None or size.min() < 100:  # no window has it
+    size = np.array((camera.image_width, camera.image_height), float)
+    if not 100 <= size.min() <= size.max() <= 20_000:  # no window has it
         return Framing.size
+    if width is None and size[0] < size[1]:
+        width = min(size[0], Framing.narrow - 1)
     if width is not None:
         size *= width / size[0]
     return round(size[0]), round(size[1])
@@ -126,8 +117,10 @@ def view_of(
     elif panels:
         right, up = directions(panels[0], task.camera)
         direction, above = np.cross(up, right), TITLE_ROOM * up
+        if np.linalg.norm(direction[:2]) < OFF_VERTICAL:  # a camera that looks straight down has no right and left
+            direction = direction + OFF_VERTICAL * up
         places = np.concatenate([area.border + offset for area in panels for offset in (np.zeros(3), above)])
-    return framed(places, np.asarray(VIEWS.get(view, direction)), *framing.free)
+    return framed_from_above(places, np.asarray(VIEWS.get(view, direction)), framing)
 
 
 def places_of(task: Task, arm_size: float = 1.0) -> Array:
@@ -214,7 +207,21 @@ def followed(pose: Pose, framing: Framing, own: Framing) -> Pose:
     (ahead, right, up), depth = axes(look_at - position), np.linalg.norm(look_at - position)
     across, upright = (tangents[:, None] for tangents in framing.free)
     sides, heights = position + depth * (ahead + across * right), position + depth * (ahead + upright * up)
-    return framed(np.concatenate([sides, heights]), ahead, *own.free)
+    return framed_from_above(np.concatenate([sides, heights]), ahead, own)
+
+
+def framed_from_above(points: Array, direction: Array, framing: Framing) -> Pose:
+    """Return the camera that sees all points (N, 3), metres, in the free part of a window, from above the table.
+
+    The free part of a narrow window is its upper one: a level camera would stand far below what it shows. It looks
+    down from the `direction` (3,) of sight as far as needed.
+    """
+    (ahead, _, up), pitch = axes(direction), 0.0
+    pose = framed(points, ahead, *framing.free)
+    while pose[0][2] < LOWEST and pitch < STEEPEST:
+        pitch += TILT
+        pose = framed(points, np.cos(pitch) * ahead - np.sin(pitch) * up, *framing.free)
+    return pose
 
 
 def framed(points: Array, direction: Array, across: Array, upright: Array) -> Pose:
@@ -242,6 +249,12 @@ def framed(points: Array, direction: Array, across: Array, upright: Array) -> Po
     return position, position + float((depth.min() + depth.max()) / 2 - w) * ahead
 
 
+def _reported_pose(camera: Any) -> Pose | None:  # noqa: ANN401 - of viser
+    """Return the pose of a camera; None where its numbers are no places."""
+    position, look_at = np.array([camera.position, camera.look_at], float)
+    return (position, look_at) if (np.abs([position, look_at]) <= MAX_SIGHT).all() else None
+
+
 class CameraController:
     """Moves one visitor's camera.
 
@@ -267,12 +280,14 @@ class CameraController:
         """Whether the camera is put back where a visitor moves it, and turns slowly around what it shows."""
         self._client, self._hand, self._moved = client, hand, moved
         self._lock = threading.RLock()  # tasks, ticks and reports come from threads of their own
-        self._given: deque[Pose] = deque(maxlen=64)
-        """Poses that the camera was given since it took another view, the newest last: a browser reports late."""
+        self._given: deque[Pose] = deque(maxlen=128)
+        """Poses that the camera was given, the newest last, and where it was before each.
+
+        A browser reports late, and until it draws, a place where the camera was with the look-at that it was given.
+        """
         self._chosen: Pose | None = None
         """Pose that the visitor has moved the camera to; None if it stands where it was put."""
-        self._framing = Framing(arm_size=arm_size)
-        """The framing of the current view."""
+        self._framing = Framing(arm_size=arm_size)  # the framing of the current view
         self._width: float | None = None
         self._shown: tuple[Task, Sequence[Slice], str] | None = None
         """Task, panels and view that the camera was put to show."""
@@ -309,11 +324,10 @@ class CameraController:
     @property
     def seen(self) -> tuple[Pose, Framing] | None:
         """Where the camera is, as the browser told, and the window; None where it looks straight up or down."""
-        camera = self._client.camera
-        position, look_at = (gestures.vector(place, 3, MAX_SIGHT) for place in (camera.position, camera.look_at))
-        if position is None or look_at is None or np.linalg.norm((look_at - position)[:2]) < MOVED:
+        pose = _reported_pose(self._client.camera)
+        if pose is None or np.linalg.norm((pose[1] - pose[0])[:2]) < MOVED:
             return None
-        return (position, look_at), self.framing
+        return pose, self.framing
 
     def shot(self, size: tuple[int, int]) -> Shot:
         """Return the camera of a picture, of a width and height in pixels, of what is seen beside the panel."""
@@ -330,7 +344,6 @@ class CameraController:
         """Move the camera to where the task, or the panels beside its scene, are seen best."""
         with self._lock:
             self._shown = task, panels, HOME
-            self._given.clear()
             self._frame()
 
     def view(self, name: str = HOME) -> None:
@@ -338,7 +351,6 @@ class CameraController:
         with self._lock:
             if self._shown is not None:
                 self._shown = (*self._shown[:2], name)
-                self._given.clear()
                 self._frame()
         self._moved()
 
@@ -384,28 +396,31 @@ class CameraController:
             self._frame()
 
     def _put(self, pose: Pose) -> None:
-        self._given.append(pose)
+        before = _reported_pose(self._client.camera)
+        self._given.extend([pose] if before is None else [before, pose])
         self._chosen = None
         with self._client.atomic():  # one without the other would be a pose that nobody has given
             self._client.camera.position, self._client.camera.look_at = pose
 
     async def _reported(self, camera: viser.CameraHandle) -> None:
         """Take note of where the camera is: put it back, leave it, or fit the picture to a window of another size."""
-        position, look_at = (gestures.vector(place, 3, MAX_SIGHT) for place in (camera.position, camera.look_at))
-        if position is None or look_at is None or self._shown is None:
+        reported = _reported_pose(camera)
+        if reported is None or self._shown is None:
             return
         with self._lock:
-            reported = np.stack([position, look_at])
-            known = [*self._given, *([] if self._chosen is None else [self._chosen])]
-            moved = all(np.abs(reported - pose).max() > MOVED for pose in known)
+            before = self._chosen
+            known = np.array([*self._given, *([] if before is None else [before])])
+            # a move is to a place, or looks at one, where the camera was not
+            moved = bool((np.abs(reported - known).max(axis=2).min(axis=0) > MOVED).any())
             if moved and self.locked:
                 self._put(self._chosen or self._given[-1])
             elif moved:
-                self._chosen = position, look_at
+                self._chosen = reported
                 if self._turned is not None:
                     self._turned = time.monotonic() + PAUSE
-            elif self._chosen is not None and np.abs(reported - self._given[-1]).max() <= MOVED:
+            elif before is not None and np.abs(np.subtract(reported, self._given[-1])).max() <= MOVED:
                 self._chosen = None
+            changed = moved or self._chosen is not before
             self._fit()
-        if moved:
+        if changed:
             self._moved()

@@ -67,8 +67,7 @@ def diverging(anchors: Sequence[Colour]) -> NDArray[np.uint8]:
 class Scale:
     """Map from numbers to colours; those beyond `low` and `high` get the end colours."""
 
-    shades: NDArray[np.uint8]
-    """(NUM_SHADES, 3) sRGB colours."""
+    shades: NDArray[np.uint8]  # (NUM_SHADES, 3) sRGB colours
     low: float
     high: float
 

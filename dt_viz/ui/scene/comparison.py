@@ -16,17 +16,14 @@ from dt_viz.session.comparison import OTHERS, OURS
 from dt_viz.session.frame import Compared, Frame, Stage
 from dt_viz.ui.playback import Replay
 from dt_viz.ui.scene.arm import GhostArm
-from dt_viz.ui.scene.key import Key
-from dt_viz.ui.scene.palette import LIGHT, Colour, Theme
-from dt_viz.ui.scene.picture import Lines, Look, Picture, add_label
-from dt_viz.ui.scene.style import STYLES
+from dt_viz.ui.scene.palette import LIGHT, STYLES, Colour
+from dt_viz.ui.scene.picture import Key, Lines, Look, Picture, add_label
 
 COLOURS: Mapping[str, Colour] = {
     method.name: colour for method, colour in zip(OTHERS, cycle(LIGHT.compared), strict=False)
 }
 """Colour of each method's motions, by its name."""
-APART = 0.045
-"""Height of one name above another, metres."""
+APART = 0.045  # height of one name above another, metres
 
 
 def followed(frame: Frame) -> dict[str, Compared]:
@@ -45,25 +42,6 @@ class _DrawnMotions:
         self.others = Lines(scene, f"{node}/others", STYLES.compared, number)
         self.label = add_label(scene, f"{node}/name", title)
 
-    def show(self, compared: Compared, ours: Array, names: list[Array], theme: Theme) -> None:
-        """Show motions, with the name where the one that is followed is farthest from ours.
-
-        Args:
-            compared: the motions.
-            ours: (N, 3) path, metres.
-            names: places (3,) of other names, metres, which this one is kept clear of; it is appended.
-            theme: colours.
-        """
-        path = compared.paths[compared.rollout]
-        self.followed.show([path], theme)
-        self.others.show(compared.paths[: compared.rollout] + compared.paths[compared.rollout + 1 :], theme)
-        self.node.visible = True
-        place = path[np.argmax(distance_from_path(path, ours))] + np.array([0.0, 0.0, 0.012])
-        while any(np.linalg.norm(place - other) < 0.9 * APART for other in names):
-            place = place + np.array([0.0, 0.0, APART])
-        names.append(place)
-        self.label.position = place
-
 
 class ComparedMotions(Picture):
     """Motions of the methods that the view compares with ours, each in its colour."""
@@ -71,8 +49,7 @@ class ComparedMotions(Picture):
     def __init__(self, scene: viser.SceneApi) -> None:
         super().__init__(scene.add_frame("/compared", show_axes=False, visible=False))
         self._scene = scene
-        self.motions: dict[str, _DrawnMotions] = {}
-        """Of the methods that were ever shown."""
+        self.motions: dict[str, _DrawnMotions] = {}  # of the methods that were ever shown
 
     @property
     def key(self) -> Key | None:
@@ -96,12 +73,20 @@ class ComparedMotions(Picture):
         shown = followed(frame)
         for name in set(self.motions) - set(shown):
             self.motions[name].node.visible = False
-        names: list[Array] = []
+        names: list[Array] = []  # places of names, each where its motion is farthest from ours, clear of the others
         for name, compared in shown.items():
+            ours = next(path for path in frame.rollouts[frame.chosen or 0 :] if len(path))
             if name not in self.motions:
                 self.motions[name] = _DrawnMotions(self._scene, name, compared.method.title)
-            ours = next(path for path in frame.rollouts[frame.chosen or 0 :] if len(path))
-            self.motions[name].show(compared, ours, names, look.theme)
+            motions, rollout = self.motions[name], compared.rollout
+            motions.followed.show([path := compared.paths[rollout]], look.theme)
+            motions.others.show(compared.paths[:rollout] + compared.paths[rollout + 1 :], look.theme)
+            motions.node.visible = True
+            place = path[np.argmax(distance_from_path(path, ours))] + np.array([0.0, 0.0, 0.012])
+            while any(np.linalg.norm(place - other) < 0.9 * APART for other in names):
+                place = place + np.array([0.0, 0.0, APART])
+            names.append(place)
+            motions.label.position = place
 
 
 class TheirArm:

@@ -16,25 +16,21 @@ from numpy.typing import NDArray
 
 from dt_viz.avoidance.transform import Anchored, axes_of
 from dt_viz.flows.fields import Array
-from dt_viz.obstacles.shapes import CloudObstacle, MeshObstacle, Obstacle, Sphere, as_point, as_quaternion
+from dt_viz.obstacles.shapes import DIAMETER, CloudObstacle, MeshObstacle, Obstacle, Sphere, as_point, as_quaternion
 from dt_viz.robot.robot import Robot
-from dt_viz.scenario.scenario import MAX_DIAMETER, Scenario, Start
+from dt_viz.scenario.scenario import MAX_SIGHT, MAX_TURN, MIN_TURN, Scenario, Start
 from dt_viz.scenario.slices import Slice, SlicePose
 from dt_viz.scenario.stack import anchored, selected, with_avoidance, with_transform
 from dt_viz.scenario.starts import followed, struck, with_moved_start, with_start
 from dt_viz.session.frame import Frame
 from dt_viz.session.session import Session
-from dt_viz.ui.gestures import Clicks
-from dt_viz.ui.scene.links import simplified
+from dt_viz.ui.scene.arm import simplified
 from dt_viz.ui.scene.markers import Draggable, Marker, MarkerGroup
-from dt_viz.ui.scene.palette import LIGHT
+from dt_viz.ui.scene.palette import LIGHT, STYLES
 from dt_viz.ui.scene.picture import Lines, Look, add_ball, add_label
-from dt_viz.ui.scene.style import STYLES
 
-CREASE = 0.6
-"""Angle between neighbouring faces above which their edge is drawn sharp, rad."""
-MAX_FACES = 30_000
-"""Largest number of faces of a mesh that is drawn in full."""
+CREASE = 0.6  # angle between neighbouring faces above which their edge is drawn sharp, rad
+MAX_FACES = 30_000  # largest number of faces of a mesh that is drawn in full
 FINEST = 0.035
 """Size of the cells in which a larger mesh's vertices are merged, in radii of the obstacle."""
 
@@ -80,7 +76,7 @@ class Obstacles(MarkerGroup[ObstacleMarker]):
             marker.mesh.vertices, marker.mesh.faces = shaded(shape)
             marker.node.disable_rotations = isinstance(shape, Sphere)
         marker.mesh.scale = scale
-        marker.scale = 0.1 + 0.2 * min(thing.radius / MAX_DIAMETER, 0.8)
+        marker.scale = 0.1 + 0.2 * min(thing.radius / DIAMETER[1], 0.8)
         opened = scenario.view.colour == "occupancy"  # without the front faces the inside is seen
         marker.mesh.side = "back" if opened else "front"
         style = STYLES.obstacle if scenario.avoids else STYLES.obstacle_faint
@@ -199,7 +195,7 @@ class Starts(MarkerGroup[Marker]):
 
     def __init__(self, scene: viser.SceneApi, session: Callable[[], Session]) -> None:
         super().__init__(scene, scene.add_frame("/starts", show_axes=False), session)
-        self._clicks = Clicks(scene, self.click)
+        self._listens = False
 
     def draw(self, frame: Frame, look: Look) -> None:
         """Remembers the slice; starts without a motion are grey."""
@@ -211,7 +207,18 @@ class Starts(MarkerGroup[Marker]):
     def adopt(self, scenario: Scenario) -> None:
         """Show the scenario's starts, and listen to clicks on the slice if the view says so."""
         super().adopt(scenario)
-        self._clicks.listen(scenario.view.click_to_start)
+        if scenario.view.click_to_start != self._listens:
+            self._listens = not self._listens
+            listener: Any = self._aimed  # viser takes coroutines, too, against its type hints
+            if self._listens:
+                self.scene.on_click()(listener)
+            else:
+                self.scene.remove_click_callback(listener)
+
+    async def _aimed(self, event: viser.SceneClickEvent) -> None:
+        origin, direction = np.array(event.ray_origin, float), np.array(event.ray_direction, float)  # NaN without one
+        if (np.abs(origin) <= MAX_SIGHT).all() and MIN_TURN <= np.linalg.norm(direction) <= MAX_TURN:
+            self.click(origin, direction)
 
     def clicked(self, marker: Marker) -> None:
         """Have the arm begin there."""
@@ -299,8 +306,7 @@ class MovableSlice(MarkerGroup[Marker]):
 class Grip(Draggable[Marker]):
     """A ball that moves with the hand, and is dragged parallel to the slice: the arm takes it there."""
 
-    _slice: Slice | None = None
-    """Slice of the last frame."""
+    _slice: Slice | None = None  # slice of the last frame
 
     def __init__(
         self,

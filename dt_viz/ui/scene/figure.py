@@ -7,36 +7,36 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from PIL import Image, ImageDraw
+from PIL import Image, ImageColor, ImageDraw
 from scipy.ndimage import gaussian_filter
 
 from dt_viz.avoidance.bias import BiasPoint
-from dt_viz.flows.fields import Array
-from dt_viz.obstacles.shapes import Obstacle, Point, rotation
+from dt_viz.flows.fields import Array, Mask
+from dt_viz.obstacles.shapes import Obstacle, Point, nearest, rotation
 from dt_viz.pictures.figures import Arrows, Drawing, Levels, Strokes, check_installed, encoded, scene_figure
 from dt_viz.pictures.panels import PanelPicture
 from dt_viz.pictures.slice_fields import ColourPicture
-from dt_viz.scenario.panels import directions
-from dt_viz.scenario.slices import Slice
+from dt_viz.scenario.slices import Slice, directions
 from dt_viz.session.comparison import OURS
 from dt_viz.session.frame import Compared, Frame
 from dt_viz.ui.scene.comparison import COLOURS, followed
-from dt_viz.ui.scene.palette import LIGHT, Colour
+from dt_viz.ui.scene.palette import LIGHT, STYLES, Colour, Style
+from dt_viz.ui.scene.picture import Key
 from dt_viz.ui.scene.slice_layers import CM2
-from dt_viz.ui.scene.style import STYLES, Style
 
-SUFFIXES = (".svg", ".pdf")
-"""Suffixes of the files."""
-PIXEL = 1e-3
-"""Spacing of the lattice on which the outlines of bodies are found, metres."""
-DET_LEVELS = (0.1, 0.3, 1.0, 3.0, 10.0)
-"""Values of det J whose level lines are drawn."""
-OCCUPIED = (0.25, 0.5, 0.75)
-"""Probabilities of being occupied whose level lines are drawn."""
-NUM_LEVELS = 8
-"""Largest number of level lines of the Lyapunov value."""
+Step = Callable[[float], None]
+"""Function that takes the part of a file that is made, from 0 to 1; it raises UnwantedError where that is cancelled."""
+SUFFIXES = (".svg", ".pdf")  # suffixes of the files
+PIXEL = 1e-3  # spacing of the lattice on which the outlines of bodies are found, metres
+DET_LEVELS = (0.1, 0.3, 1.0, 3.0, 10.0)  # values of det J whose level lines are drawn
+OCCUPIED = (0.25, 0.5, 0.75)  # probabilities of being occupied whose level lines are drawn
+NUM_LEVELS = 8  # largest number of level lines of the Lyapunov value
 _DRAWING = threading.Lock()
 """Held while matplotlib draws: its settings and fonts are shared by all threads."""
+
+
+def ignored(_part: float) -> None:
+    """A `Step` that shows nothing."""
 
 
 @dataclass(frozen=True)
@@ -44,12 +44,12 @@ class _Plane:
     """A rectangle as the camera of the task reads it: places on it in metres, to the right and up from its middle."""
 
     area: Slice
-    axes: Array
-    """(3, 2) to the right and up."""
+    axes: Array  # (3, 2) to the right and up
+    bodies: tuple[Obstacle, ...] = ()  # obstacles that hide the lines drawn here
 
     @classmethod
-    def of(cls, area: Slice, frame: Frame) -> _Plane:
-        return cls(area, np.stack(directions(area, frame.task.camera), axis=1))
+    def of(cls, area: Slice, frame: Frame, bodies: tuple[Obstacle, ...] = ()) -> _Plane:
+        return cls(area, np.stack(directions(area, frame.task.camera), axis=1), bodies)
 
     def across(self, points: Array) -> Array:
         """Places (*B, 2) of world points (*B, 3), metres."""
@@ -57,9 +57,23 @@ class _Plane:
 
     def strokes(self, label: str, style: Style, paths: Iterable[Array] | None, number: int = 0) -> Strokes:
         """Paths (T_i, 3), metres, if any, in the style's colour of a number; empty ones are left out."""
-        seen = [self.across(path) for path in (() if paths is None else paths) if len(path)]
+        given = [path for path in (() if paths is None else paths) if len(path)]
+        seen, hidden = [self.across(path) for path in given], [self.hidden(path) for path in given]
         width, is_directed = style.width or style.radius, style in (STYLES.streamline, STYLES.panel_streamline)
-        return Strokes(label, seen, _hex(style.on(LIGHT, number)), width, bool(style.dash), is_directed, style.ball > 0)
+        colour = _hex(style.on(LIGHT, number))
+        return Strokes(label, seen, colour, width, bool(style.dash), is_directed, style.ball > 0, hidden)
+
+    def hidden(self, points: Array) -> Mask:
+        """Which (N,) of some points (N, 3), metres, a body hides from who looks at the plane, or has in it."""
+        toward, hidden = np.cross(*self.axes.T), np.zeros(len(points), bool)
+        end = max((body.position @ toward + body.radius for body in self.bodies), default=-np.inf)
+        gone, rows = np.zeros(len(points)), np.arange(len(points))
+        while len(rows := rows[points[rows] @ toward + gone[rows] < end]):  # nothing lies between there and the eye
+            distance = nearest(self.bodies, points[rows] + gone[rows, None] * toward)
+            hidden[rows] = distance < 0
+            gone[rows] += np.maximum(distance, PIXEL)
+            rows = rows[distance >= 0]
+        return hidden
 
     def points(self, places: Sequence[Array | Point], colour: Colour) -> tuple[Array, str]:
         """Places in the world, metres, and their colour."""
@@ -102,10 +116,8 @@ class _Plane:
         return Drawing(title, -half, half, strokes, levels, seen, points)
 
 
-def render_figure(frame: Frame, suffix: str, step: Callable[[float], None] = lambda _part: None) -> bytes:
+def render_figure(frame: Frame, suffix: str, step: Step = ignored) -> bytes:
     """Return the figure of a frame as the content of a file with one of `SUFFIXES`.
-
-    `step` is told which part is done, from 0 to 1, and may raise to cancel.
 
     Raises:
         FormatError: matplotlib is not installed.
@@ -122,6 +134,15 @@ def render_figure(frame: Frame, suffix: str, step: Callable[[float], None] = lam
         return encoded(figure, suffix)
 
 
+def key_of(frame: Frame) -> Key:
+    """Return the names and colours of what the scene of a frame shows."""
+    drawing = _scene(frame, "")
+    named = {one.label: one.colour for one in drawing.strokes if one.paths}
+    named |= {one.label: one.colour for one in drawing.levels if one.is_body}
+    named |= {label: colour for label, (_, colour) in drawing.points.items()}
+    return Key(tuple((label, ImageColor.getrgb(colour)[:3]) for label, colour in named.items()))
+
+
 def _scene(frame: Frame, title: str) -> Drawing:
     """The scene itself, with what its view shows; without a motion only what it is about."""
     view, pictures, moves = frame.scenario.view, frame.pictures, not frame.blocked
@@ -131,7 +152,8 @@ def _scene(frame: Frame, title: str) -> Drawing:
     ghost = [path for place, path in enumerate(frame.ghost) if place == frame.chosen and view.ghost and moves]
     others = followed(frame)
     beside = [path for compared in others.values() for path in compared.paths]
-    plane = _Plane.of(frame.slice.holding([*frame.task.paths, *rollouts.values(), *beside]), frame)
+    area = frame.slice.holding([*frame.task.paths, *rollouts.values(), *beside])
+    plane = _Plane.of(area, frame, frame.scenario.obstacles)
     strokes = [
         plane.strokes("warped grid", STYLES.grid, pictures.grid),
         plane.strokes("streamlines", STYLES.streamline, pictures.streamlines),

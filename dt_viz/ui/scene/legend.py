@@ -13,8 +13,8 @@ from dt_viz.pictures.slice_fields import ColourPicture
 from dt_viz.scenario.scenario import SliceColour
 from dt_viz.session.frame import Frame
 from dt_viz.ui.scene.colour_scale import NUM_SHADES, Scale
-from dt_viz.ui.scene.key import INK, Key, plate
 from dt_viz.ui.scene.palette import LIGHT, Colour, css
+from dt_viz.ui.scene.picture import INK, Key, plate
 from dt_viz.ui.scene.slice_layers import DET_DECADES, OCCUPANCY_SCALE, scale_of
 
 
@@ -22,15 +22,11 @@ from dt_viz.ui.scene.slice_layers import DET_DECADES, OCCUPANCY_SCALE, scale_of
 class Legend:
     """A scale of colours with numbers, from left to right. Texts are ASCII: Pillow's own font has hardly more."""
 
-    title: str
-    """Quantity with its unit."""
+    title: str  # quantity with its unit
     scale: Scale
-    ticks: tuple[tuple[float, str], ...]
-    """Values and their labels."""
-    note: str = ""
-    """Text below the scale."""
-    swatch: Colour | None = None
-    """Colour that the note explains."""
+    ticks: tuple[tuple[float, str], ...]  # values and their labels
+    note: str = ""  # text below the scale
+    swatch: Colour | None = None  # colour that the note explains
 
     @property
     def html(self) -> str:

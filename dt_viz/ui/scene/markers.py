@@ -6,8 +6,7 @@ import threading
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
@@ -15,13 +14,33 @@ import viser
 from numpy.typing import ArrayLike
 
 from dt_viz.flows.fields import Array
-from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.scenario import MAX_DISTANCE, MAX_SIGHT, MAX_TURN, MIN_TURN, Scenario
 from dt_viz.scenario.slices import Slice
 from dt_viz.session.frame import Frame
 from dt_viz.session.session import Session
-from dt_viz.ui import gestures, patches
-from dt_viz.ui.gestures import Drag
+from dt_viz.ui import patches
 from dt_viz.ui.scene.picture import Look, Picture
+
+
+@dataclass(frozen=True)
+class Drag:
+    """An event of dragging something in the scene; places (3,) in metres."""
+
+    phase: str  # one of "start", "update" and "end"
+    camera: Array
+    grabbed: Array
+    """Grabbed point, which moves with the thing in the browser: after the start it may lag behind the server."""
+    pointer: Array  # pointer, on the plane through the grabbed point that faces the camera
+
+
+def on_drag(node: Any, act: Callable[[Drag], None]) -> None:  # noqa: ANN401 - viser's nodes of all kinds
+    """Call `act`, which must only submit, with each event of dragging a visible node, among places that can be seen."""
+
+    @node.on_drag
+    async def _(event: viser.SceneNodeDragEvent) -> None:
+        places = np.array([event.client.camera.position, event.start_position, event.end_position], float)
+        if node.visible and (np.abs(places) <= MAX_SIGHT).all():
+            act(Drag(event.phase, *places))
 
 
 class Marker:
@@ -49,24 +68,20 @@ class Marker:
             where: returns the place (3,), metres, of a thing that moves by itself, and not where it is dragged.
         """
         self.node, self.body, self.scale = node, body, scale
-        self.key: int | str = 0
-        """Index or name of the thing in the scenario."""
+        self.key: int | str = 0  # index or name of the thing in the scenario
         self._group, self._where = group, where
         self._position, self._wxyz = np.array(node.position), np.array(node.wxyz)
         self._drag: tuple[Array, Array] | None = None
         """Point (3,) at which the current drag of the body has grabbed it, and its position (3,) then, metres."""
-        self._asked = self._position
-        """Last permitted position (3,) that the drag asked for, metres."""
-        self._wanted = False
-        """Whether it has handles, also while they are hidden for a picture."""
-        self._refused = False
-        """Whether the current drag of a handle has left the permitted space."""
+        self._asked = self._position  # last permitted position (3,) that the drag asked for, metres
+        self._wanted = False  # whether it has handles, also while they are hidden for a picture
+        self._refused = False  # whether the current drag of a handle has left the permitted space
         if scale:
             handled: Any = self._handled  # viser takes coroutines, too, against its type hints
             node.on_update(handled)
             self.hide_handles(True)
         if body is not None:
-            gestures.on_drag(body, self._dragged)
+            on_drag(body, self._dragged)
 
     @property
     def position(self) -> Array:
@@ -99,15 +114,20 @@ class Marker:
 
     async def _handled(self, event: viser.TransformControlsEvent) -> None:
         """Take a pose that the user gives it by the handles, if they are shown; else put it back."""
-        position, wxyz = gestures.place(self.node.position), gestures.turn(self.node.wxyz)
-        can_move = self._wanted and self.node.visible and event.phase in gestures.PHASES
-        taken = position is not None and wxyz is not None and can_move
+        position, wxyz = np.array(self.node.position, float), np.array(self.node.wxyz, float)
+        is_pose = (np.abs(position) <= MAX_DISTANCE).all() and MIN_TURN <= np.linalg.norm(wxyz) <= MAX_TURN
+        taken = is_pose and self._wanted and self.node.visible  # a message may name a hidden one
         if not taken or (self._refused and event.phase == "end"):  # during the drag the browser ignores poses
             self._put_back()
         self._refused = not taken or (self._refused and event.phase == "update")
-        if position is not None and wxyz is not None and can_move:
+        if taken:
             self._position, self._wxyz = position, wxyz
             self._group.moved(self, position.copy(), wxyz.copy(), event.phase)
+
+    async def clicked(self, _event: viser.SceneNodePointerEvent) -> None:
+        """Take a click, which a message may say of a hidden body, too."""
+        if self.body.visible:
+            self._group.clicked(self)
 
     def _put_back(self) -> None:
         patches.put_back_pose(self.node, self._position, self._wxyz)
@@ -125,8 +145,8 @@ class Marker:
             self._asked = drag.grabbed if stands is None else stands
             self._drag = drag.grabbed, self._asked
         grabbed, stood = self._drag
-        place = gestures.place(stood + in_slice(self._group.area, drag.camera, grabbed, drag.pointer))
-        self._asked = self._asked if place is None else place
+        place = stood + in_slice(self._group.area, drag.camera, grabbed, drag.pointer)
+        self._asked = place if (np.abs(place) <= MAX_DISTANCE).all() else self._asked
         if drag.phase == "end":
             self._drag = None
         if self._where is None:
@@ -146,6 +166,9 @@ class Draggable(Picture, Generic[M]):
     def grabbed(self, marker: M) -> None:
         """Take the beginning of a drag of a marker, if that means anything."""
 
+    def clicked(self, marker: M) -> None:
+        """Take a click on a marker, if that means anything."""
+
     @abstractmethod
     def moved(self, marker: M, position: Array, wxyz: Array, phase: str) -> None:
         """Take a new pose of a marker, (3,), metres, and (4,), and the phase of the drag."""
@@ -154,12 +177,10 @@ class Draggable(Picture, Generic[M]):
 class MarkerGroup(Draggable[M]):
     """Markers of all things of one kind, in the order of the scenario."""
 
-    gesture: ClassVar[str]
-    """Name of the edits that move one, for undo; its key is filled in."""
+    gesture: ClassVar[str]  # name of the edits that move one, for undo; its key is filled in
     chosen: ClassVar[str] = ""
     """Field of the view that names the thing with handles; empty where none can be chosen."""
-    handles: ClassVar[str] = ""
-    """Field of the view that says whether it has handles."""
+    handles: ClassVar[str] = ""  # field of the view that says whether it has handles
 
     def __init__(self, scene: viser.SceneApi, node: Any, session: Callable[[], Session]) -> None:  # noqa: ANN401
         """Begin with none, under a node of the scene; `session` returns the one that is edited."""
@@ -205,7 +226,7 @@ class MarkerGroup(Draggable[M]):
             while len(self.items) < len(things):
                 self.items.append(marker := self._new(len(self.items)))
                 if marker.body is not None:
-                    gestures.on_click(marker.body, partial(self.clicked, marker))
+                    marker.body.on_click(marker.clicked)
         for marker, (key, thing) in zip(self.items, things.items(), strict=True):
             marker.key = key
             self._show(marker, thing, scenario)
@@ -226,7 +247,7 @@ class MarkerGroup(Draggable[M]):
         self._select(**{self.chosen: marker.key} if self.chosen else {})
 
     def clicked(self, marker: M) -> None:
-        """Take a click on a marker: it gets handles, or loses them."""
+        """Give the marker handles, or take them from it."""
         scenario = self._session().scenario
         has_handles = getattr(scenario.view, self.handles) and marker.key == self._selected(scenario)
         self._select(**{self.chosen: marker.key, self.handles: not has_handles})

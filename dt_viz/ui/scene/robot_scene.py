@@ -12,10 +12,9 @@ from dt_viz.scenario.scenario import View
 from dt_viz.session.frame import Frame, Stage
 from dt_viz.ui.playback import Playback, Replay
 from dt_viz.ui.scene.arm import Arms
-from dt_viz.ui.scene.carried import Carried
+from dt_viz.ui.scene.carried import Carried, HandPath
 from dt_viz.ui.scene.comparison import TheirArm
 from dt_viz.ui.scene.draggables import Grip
-from dt_viz.ui.scene.hand import HandPath
 from dt_viz.ui.scene.palette import LIGHT, Theme
 from dt_viz.ui.scene.picture import Look
 from dt_viz.ui.scene.tubes import RolloutTubes
@@ -34,8 +33,7 @@ class RobotScene:
         self.path = HandPath(scene)
         self.grip = Grip(scene, robot, node, lambda: self.hand, self._hold)
         self._view, self._theme = View(), LIGHT
-        self._aside = False
-        """Whether what the arm is about to do is not shown."""
+        self._aside = False  # whether what the arm is about to do is not shown
         self._posed: tuple[bytes, bool, int] | None = None
         """The posture that was drawn last, whether with that without avoidance, and after how many jumps."""
 

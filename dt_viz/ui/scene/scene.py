@@ -18,18 +18,21 @@ from dt_viz.session.frame import Frame
 from dt_viz.session.opening import Preview
 from dt_viz.session.session import Session
 from dt_viz.ui.scene.arm import ArmSequence
-from dt_viz.ui.scene.board import Board
 from dt_viz.ui.scene.comparison import ComparedMotions
 from dt_viz.ui.scene.draggables import BiasPoints, MovableSlice, Obstacles, Starts
-from dt_viz.ui.scene.key import Key
-from dt_viz.ui.scene.palette import LIGHT, Theme
-from dt_viz.ui.scene.panels import Panels
-from dt_viz.ui.scene.picture import Look, Picture, add_ball, add_label
-from dt_viz.ui.scene.rollouts import LevelRollouts, Rollouts, demonstrations, ghost
-from dt_viz.ui.scene.slice_layers import ColourSlice, FieldArrows, Generator, OccupancySlice, Streamlines, WarpedGrid
-from dt_viz.ui.scene.stage import Stage
-from dt_viz.ui.scene.style import STYLES
-from dt_viz.ui.scene.takes import Takes
+from dt_viz.ui.scene.palette import LIGHT, STYLES, Theme
+from dt_viz.ui.scene.picture import Key, Look, Picture, add_ball, add_label
+from dt_viz.ui.scene.rollouts import LevelRollouts, Rollouts, Takes, demonstrations, ghost
+from dt_viz.ui.scene.slice_layers import (
+    ColourSlice,
+    FieldArrows,
+    Generator,
+    OccupancySlice,
+    Panels,
+    Streamlines,
+    WarpedGrid,
+)
+from dt_viz.ui.scene.stage import Board, Stage
 from dt_viz.ui.scene.tubes import RolloutTubes
 
 GOAL, OLD_GOAL = "goal", "demonstrated goal"
@@ -100,15 +103,13 @@ class ScenePictures:
             "occupancy": OccupancySlice(scene),
         }
         self._takes = Takes(scene)
-        self.board = Board(scene)
-        """What a visitor draws on."""
+        self.board = Board(scene)  # what a visitor draws on
         self._showing = threading.Lock()  # views change on another thread than the one that draws
         self._drawing = threading.Lock()
         self._frame: Frame | None = None
         self._adopted: Scenario | None = None
         self._theme = LIGHT
-        self.look = Look()
-        """What the last frame was drawn with."""
+        self.look = Look()  # what the last frame was drawn with
 
     def layer(self, view: str) -> Picture:
         """The picture that this field of `View` shows or hides."""

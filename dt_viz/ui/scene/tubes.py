@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import numpy as np
 import viser
@@ -12,11 +12,10 @@ from scipy.spatial import KDTree
 
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.kernels.tubes import evenly_bent, tubes
-from dt_viz.ui.scene.palette import LIGHT, Theme
-from dt_viz.ui.scene.style import Style
+from dt_viz.memo import cached_property
+from dt_viz.ui.scene.palette import LIGHT, Style, Theme
 
-NUM_RINGS, NUM_SIDES = 80, 7
-"""Numbers of rings along a tube, and of corners of a ring."""
+NUM_RINGS, NUM_SIDES = 80, 7  # numbers of rings along a tube, and of corners of a ring
 INSIDE = 0.0035
 """Distance of a line from the middle of a rollout up to which it counts as inside its tube, metres."""
 
@@ -53,8 +52,7 @@ class Tubes:
         self.node.color = self._style.on(theme)
 
 
-_NOTHING = np.zeros((3, 3), np.float32), np.array([[0, 1, 2]])
-"""A triangle without size."""
+_NOTHING = np.zeros((3, 3), np.float32), np.array([[0, 1, 2]])  # a triangle without size
 
 
 @lru_cache(maxsize=16)
@@ -77,10 +75,8 @@ def middles_of(paths: Sequence[Array]) -> Array:
 class RolloutTubes:
     """Where the tubes of a frame's rollouts lie, computed once for all that is drawn beside them."""
 
-    rollouts: tuple[Array, ...] = ()
-    """(T_i, 3), metres; empty ones have no tube."""
-    shown: bool = True
-    """Whether the tubes are shown; hidden ones cover nothing."""
+    rollouts: tuple[Array, ...] = ()  # (T_i, 3), metres; empty ones have no tube
+    shown: bool = True  # whether the tubes are shown; hidden ones cover nothing
 
     @cached_property
     def middles(self) -> Array:

@@ -30,8 +30,7 @@ LEGEND: Mapping[str, Colour] = {
     "goal": palette.LIGHT.goal,
 }
 """What is drawn, with its colour."""
-PAGES = {"pageup": "Page Up", "pagedown": "Page Down"}
-"""Names of keys of more than one word."""
+PAGES = {"pageup": "Page Up", "pagedown": "Page Down"}  # names of keys of more than one word
 SHIFT: Literal["shift"] = "shift"
 
 
@@ -40,12 +39,10 @@ class Command:
     """A command with its name in the palette."""
 
     label: str
-    act: Callable[[Session], None]
-    """Does it; it must only submit."""
+    act: Callable[[Session], None]  # does it; it must only submit
     key: str = ""
     """Key on which it is done; empty for none. A capital letter, a digit, or a name of viser's, such as "space"."""
-    shifted: bool = False
-    """Whether Shift is held with the key."""
+    shifted: bool = False  # whether Shift is held with the key
 
     @property
     def keys(self) -> str:

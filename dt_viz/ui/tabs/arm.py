@@ -11,17 +11,16 @@ import viser
 
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.errors import Cancelled, FormatError
-from dt_viz.robot.joint_trajectory import FORMATS
-from dt_viz.robot.rest_to_rest import rest_to_rest
+from dt_viz.robot.joint_trajectory import FORMATS, rest_to_rest
 from dt_viz.scenario.roaming import Chase, MovingGoal
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.session.frame import Stage
 from dt_viz.session.player import Play
-from dt_viz.session.recording import SPAN
 from dt_viz.session.session import Session
-from dt_viz.ui.bindings import KEEP, Bindings
-from dt_viz.ui.controls import Control
-from dt_viz.ui.tabs.saving import SaveButton, Step
+from dt_viz.ui.bindings import KEEP, Bindings, Control
+from dt_viz.ui.playback import SPAN
+from dt_viz.ui.scene.figure import Step
+from dt_viz.ui.tabs.picture import SaveButton
 from dt_viz.warning import Kind
 
 OBSTACLE_SPEEDS: Mapping[str, float] = {"Obstacle": 0.08, "Fast obstacle": 0.25}

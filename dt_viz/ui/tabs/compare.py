@@ -12,22 +12,32 @@ import numpy as np
 import viser
 from viser import uplot
 
-from dt_viz.baselines.base import INSTALL, Method
+from dt_viz.baselines.base import INSTALL, ONLY_SHIPPED, Method
 from dt_viz.motion.profiles import NUM_SAMPLES
-from dt_viz.scenario.scenario import Scenario, View
-from dt_viz.session.comparison import OTHERS, OURS
-from dt_viz.session.frame import Compared, Frame
+from dt_viz.scenario.scenario import Scenario
+from dt_viz.session.comparison import OTHERS, OURS, chosen, is_offered
+from dt_viz.session.frame import Compared
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import KEEP, Bindings
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.comparison import COLOURS
 from dt_viz.ui.scene.palette import css
-from dt_viz.ui.tabs.data import SAVE, curves_table, scores_table, table_csv
-from dt_viz.ui.tabs.plots import LARGE, add_container, add_plot, columns, curve, legend, small
+from dt_viz.ui.tabs.plots import (
+    LARGE,
+    SAVE,
+    add_container,
+    add_plot,
+    columns,
+    curve,
+    curves_table,
+    legend,
+    scores_table,
+    small,
+    table_csv,
+)
 
 NONE = "–"
-DEEP = 0.001
-"""Maximum collision distance from which on it is marked, metres."""
+DEEP = 0.001  # maximum collision distance from which on it is marked, metres
 COLUMNS = (
     ("to demo", "mean discrete Fréchet distance to the demonstrations"),
     ("hand in", "maximum collision distance of the end effector"),
@@ -50,46 +60,54 @@ class ComparePanel:
         """Methods in the plots below the table, and in those in a window."""
         with gui.add_folder("Methods"):  # closed by a click, so that the table is seen at once on a small screen
             for method in OTHERS:
-                box = gui.add_checkbox(method.title, False, disabled=bool(method.missing), hint=hint(method))
-                bindings.input(box, lambda s, name=method.name: name in s.view.compared, partial(_compare, method.name))
+                bindings.input(
+                    gui.add_checkbox(method.title, False, disabled=bool(method.missing), hint=hint(method)),
+                    lambda s, method=method: method in chosen(s.view, s.task),
+                    partial(_compare, method.name),
+                    disabled=lambda s, method=method: bool(method.missing) or not is_offered(method, s.task),
+                )
+            trained = [method for method in OTHERS if method.weights]
+            text = f"{', '.join(method.title for method in trained)}: {ONLY_SHIPPED}."
+            self.note = bindings.properties(
+                gui.add_html(small(text), visible=False),
+                visible=lambda s: not all(is_offered(method, s.task) for method in trained),
+            )
+            """Says why methods are off."""
         self.table = gui.add_html("", visible=False)
         titles = {method.title: method.name for method in OTHERS if not method.missing}
-        by_name = {name: title for title, name in titles.items()}
+        offered = lambda s: [m for m in OTHERS if not m.missing and is_offered(m, s.task)]  # noqa: E731
         bindings.input(
             gui.add_dropdown(
                 "Their arm", (NONE, *titles), hint="a second arm, which follows the motion of this method"
             ),
-            lambda s: by_name.get(s.view.their_arm, NONE),
+            lambda s: next((method.title for method in offered(s) if method.name == s.view.their_arm), NONE),
             lambda s, title: _with_their_arm(s, titles.get(title, "")),
+            options=lambda s: (NONE, *(method.title for method in offered(s))),
         )
+        compares = lambda s: bool(chosen(s.view, s.task))  # noqa: E731
         self.plots: list[tuple[viser.GuiUplotHandle, ...]] = []
         """One for each of `TITLES`, below the table and in a window."""
-        self.keys: list[viser.GuiHtmlHandle] = []
-        """Names of the curves, above both."""
+        self.keys: list[viser.GuiHtmlHandle] = []  # names of the curves, above both
         for large in (False, True):
             node, content = add_container(gui, "Along the path (fig. 6)", large=large)
             with content:
                 self.keys.append(gui.add_html(""))
                 height = 130 * (LARGE if large else 1)
                 self.plots.append(tuple(add_plot(gui, title, "path", _curves(()), height) for title in TITLES))
-            bindings.properties(
-                node, visible=lambda s, large=large: bool(s.view.compared) and s.view.large_plots == large
-            )
-        compares = lambda s: bool(s.view.compared)  # noqa: E731
+            bindings.properties(node, visible=lambda s, large=large: compares(s) and s.view.large_plots == large)
         bindings.checkbox(gui, "large_plots", visible=compares)
         what = "the table, and the curves of the plots, as CSV"
         save = gui.add_button(SAVE, icon=viser.Icon.DOWNLOAD, hint=what, visible=False)
         bindings.later(save, self._save, visible=compares)
         bindings.properties(self.table, visible=compares)
-        bindings.show(lambda s: _shown(bindings.frame, s.view) or KEEP, lambda shown: self.draw(*shown))
+        bindings.show(partial(_shown, bindings), lambda shown: self.draw(*shown))
 
     def draw(self, comparison: Sequence[Compared], large: bool) -> None:
         """Show how methods fare, with the plots below the table, or the `large` ones in a window."""
         self._comparison = comparison
         self.table.content = table_html(comparison)
-        plotted = [compared for compared in comparison if compared.curves is not None]
-        methods = tuple(compared.method for compared in plotted)
-        curves = [1e3 * compared.curves for compared in plotted if compared.curves is not None]
+        plotted = [(compared.method, 1e3 * compared.curves) for compared in comparison if compared.curves is not None]
+        methods, curves = tuple(method for method, _ in plotted), [curve for _, curve in plotted]
         along = np.linspace(0, 1, NUM_SAMPLES)
         marks = {method.title: f"background:{css(_colour(method.name))}" for method in methods}
         self.keys[large].content = legend(marks, "0.3em")
@@ -100,16 +118,14 @@ class ComparePanel:
         self._drawn[large] = methods
 
     def _save(self, _session: Session, _pressed: bool) -> None:
-        for name, table in (
-            ("methods", scores_table(self._comparison)),
-            ("methods-path", curves_table(self._comparison)),
-        ):
-            self._send(f"-{name}.csv", table_csv(table))
+        self._send("-methods.csv", table_csv(scores_table(self._comparison)))
+        self._send("-methods-path.csv", table_csv(curves_table(self._comparison)))
 
 
-def _shown(frame: Frame | None, view: View) -> tuple[Sequence[Compared], bool] | None:
-    """The methods whose table and plots are shown, and whether the plots are large; None where none are known."""
-    return (frame.comparison, view.large_plots) if frame is not None and frame.comparison and view.compared else None
+def _shown(bindings: Bindings, scenario: Scenario) -> Any:  # noqa: ANN401 - or KEEP
+    """The methods whose table and plots are shown, and whether the plots are large."""
+    comparison, view = () if bindings.frame is None else bindings.frame.comparison, scenario.view
+    return (comparison, view.large_plots) if comparison and view.compared else KEEP
 
 
 def hint(method: Method) -> str:
@@ -142,10 +158,8 @@ def _row(compared: Compared) -> str:
         f"border-radius:0.2em;margin-right:0.4em;vertical-align:-0.08em;background:{css(_colour(method.name))}'></span>"
         f"{escape(method.title)}</td>"
     )
-    values = (None,) * 4
-    if scores is not None:
-        values = (scores.frechet, scores.hand_depth, scores.arm_depth, scores.goal_error)
-    cells = "".join(_cell(value, bad=k in (1, 2) and (value or 0) > DEEP) for k, value in enumerate(values))
+    values = scores and (scores.frechet, scores.hand_depth, scores.arm_depth, scores.goal_error)
+    cells = "".join(_cell(v, bad=k in (1, 2) and (v or 0) > DEEP) for k, v in enumerate(values or (None,) * 4))
     said = compared.note or method.promise
     below = f"<td colspan=5 style='opacity:0.65;padding-left:1.2em;white-space:normal'>{escape(said)}</td>"
     return f"<tr style='vertical-align:baseline'>{name}{cells}</tr><tr>{below}</tr>"

@@ -24,14 +24,12 @@ from dt_viz.obstacles.files import (
 from dt_viz.obstacles.shapes import ORIGIN, CloudObstacle, MeshObstacle, Obstacle
 from dt_viz.scenario.scenario import MAX_OBSTACLES, Scenario
 from dt_viz.session.session import Session
-from dt_viz.ui.bindings import Bindings
-from dt_viz.ui.controls import Control, on_press
+from dt_viz.ui.bindings import Bindings, Control
 from dt_viz.warning import Severity
 
 FORMATS = ", ".join(dict.fromkeys(suffix[1:] for suffix in (*MESH_SUFFIXES, *CLOUD_SUFFIXES)))
 PLACED = "put where there is room beside the motion, not where the file has it: drag it to its place"
-LANE = "file"
-"""Lane of the session's jobs on which one file is read."""
+LANE = "file"  # lane of the session's jobs on which one file is read
 
 _one_file = threading.Lock()
 """Lock of the reader: a file takes up to a gigabyte, in another process, on its way to an obstacle."""
@@ -81,7 +79,7 @@ class FileLoader:
             file = self._upload.value
             self._begin(partial(self.load, file.content, file.name, UNITS[self.unit.value]))
 
-        on_press(self.again, lambda: self._begin(self.load_again))
+        Control(self.again, lambda _pressed: self._begin(self.load_again))
 
     def takes(self, name: str, content: bytes) -> bool:
         """Add what a file holds if its suffix says that this is a shape, and nothing else; return whether it does."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -25,11 +26,12 @@ from dt_viz.session.history import Beside
 from dt_viz.session.opening import LENGTHS, USUAL_RATES, Choices, Opened, Preview
 from dt_viz.session.session import Session
 from dt_viz.session.teaching import Stroke, taught
-from dt_viz.ui.bindings import Bindings
-from dt_viz.ui.controls import Control
+from dt_viz.ui.bindings import Bindings, Control
+from dt_viz.ui.pen import Kind, Pen
 from dt_viz.ui.scene.palette import LIGHT
 from dt_viz.ui.scripts import drop_html
 from dt_viz.ui.tabs.from_file import LANE, turn
+from dt_viz.ui.tabs.plots import small
 from dt_viz.ui.tabs.takes_table import seen_html
 from dt_viz.warning import Severity
 
@@ -80,8 +82,7 @@ class OpenPanel:
         self._bindings, self._show, self._learn, self._most, self._take = bindings, show, learn, most, take
         self._changing = threading.RLock()  # one thread reads, another inspects, and handlers close what is open
         self._opened = Opened()
-        self._seen: Preview | None = None
-        """What is shown of it."""
+        self._seen: Preview | None = None  # what is shown of it
         hint = (
             "a saved scenario; a motion that the library has saved; "
             f"demonstrations of your own: {FORMATS}, several at once, or a zip of a folder; "
@@ -225,7 +226,6 @@ class OpenPanel:
         return Lesson(opened.taught, () if opened.files else opened.lesson.left_out) if opened.taught else None
 
     def _open(self, opened: Opened) -> None:
-        """Open what was opened and taught before."""
         with self._changing:
             self._opened, self.folder.visible = opened, True
             self._put_beside()
@@ -233,7 +233,6 @@ class OpenPanel:
             self._bindings.session.jobs.submit(SEEING, self._see, latest=True)
 
     def _put_beside(self) -> None:
-        """Have Undo and Redo act on what is open, if something is."""
         undo, redo = (partial(self.later, partial(self._travel, move)) for move in (Opened.undone, Opened.redone))
         beside = Beside(self._opened.steps, undo, redo) if self.folder.visible else None
         self._bindings.session.put_beside(beside)
@@ -246,7 +245,6 @@ class OpenPanel:
             self._bindings.session.jobs.submit(SEEING, self._see, latest=True)
 
     def _travel(self, moved: Callable[[Opened], Opened]) -> None:
-        """Undo or redo a take."""
         with self._changing:
             self._teach(moved(self._opened))
 
@@ -266,7 +264,6 @@ class OpenPanel:
             self._teach(self._opened.with_take(kept))
 
     def _delete(self) -> None:
-        """Delete the take that is chosen, if it was taught."""
         with self._changing:
             self._teach(self._opened.without(self._number, self._named))
 
@@ -436,7 +433,6 @@ class OpenPanel:
         self._show(seen, number)
 
     def _offer(self, name: str, options: tuple[str, ...], value: str) -> None:
-        """Show a dropdown with options, if there are any."""
         control = self.controls[name]
         if options and control.handle.options != options:
             control.handle.options = options
@@ -450,3 +446,45 @@ class OpenPanel:
 
 def _with(choices: Choices, name: str, on: bool) -> Any:  # noqa: ANN401 - PreparationSettings
     return replace(choices.preparation, **{name: on})
+
+
+KINDS: Mapping[str, Kind] = {"Draw": "draw", "Guide the hand": "guide"}
+"""Ways of teaching, by the name of their button."""
+NAMES: Mapping[Kind, str] = {"draw": "drawn", "guide": "guided"}  # begin of the names of takes
+TOLD: Mapping[Kind, str] = {
+    "draw": "Press on the board, draw, let go: that is a take. Make two or three that end at one place, then Learn. "
+    "Escape leaves.",
+    "guide": "Drag the violet ball, turn the view, drag on. “Take done” ends a take. Make two or three that end at one "
+    "place, then Learn. Escape leaves.",
+}
+"""What is to be done, by the way of teaching."""
+
+
+class TeachPanel:
+    """Controls of teaching at the top of the folder "Your data", which takes what was taught."""
+
+    def __init__(self, gui: viser.GuiApi, bindings: Bindings, opening: OpenPanel, pen: Pen) -> None:
+        """Build the controls where the panel is being built."""
+        self._bindings, self._opening, self._pen = bindings, opening, pen
+        hint = "demonstrations of your own: drawn on a board before the arm, or by guiding its hand"
+        begin = gui.add_button("Draw your own", icon=viser.Icon.PENCIL, hint=hint, order=opening.upload.order + 0.5)
+        with opening.folder:
+            first = opening.table.order - 1
+            ways = gui.add_button_group("Teach", tuple(KINDS), hint="adds takes", order=first)
+            self._told = gui.add_html("", order=first + 0.2)
+            self._done = gui.add_button(
+                "Take done", icon=viser.Icon.CHECK, visible=False, hint="ends and keeps it", order=first + 0.5
+            )
+        opening.control(begin, lambda _pressed: self._begin("draw"))
+        opening.control(ways, lambda name: self._begin(KINDS[name]))
+        opening.control(self._done, lambda _pressed: pen.finish())
+        bindings.show(lambda s: s.arm, lambda _arm: pen.put_down())
+
+    def _begin(self, kind: Kind) -> None:
+        self._opening.teach()
+        self._done.visible, self._told.content = kind == "guide", small(html.escape(TOLD[kind]))
+        self._pen.take_up(kind, partial(self._finished, NAMES[kind]))
+        self._bindings.session.say(TOLD[kind], Severity.NOTE)
+
+    def _finished(self, name: str, stroke: Stroke, board: Slice | None) -> None:
+        self._opening.later(partial(self._opening.add, name, stroke, board))

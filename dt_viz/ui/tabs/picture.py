@@ -8,30 +8,84 @@ from functools import partial
 
 import viser
 
-from dt_viz.errors import Cancelled
+from dt_viz.errors import Cancelled, FormatError, end_if
 from dt_viz.pictures.video import VIDEO_SUFFIXES
+from dt_viz.scheduler import checkpoint
 from dt_viz.session.session import Session
 from dt_viz.ui import patches
-from dt_viz.ui.bindings import Bindings
-from dt_viz.ui.controls import Control, on_press, switch
+from dt_viz.ui.bindings import Bindings, Control
 from dt_viz.ui.scene.camera import HAND, HOME, VIEWS, CameraController, Framing
-from dt_viz.ui.scene.export import RESOLUTIONS
-from dt_viz.ui.scene.figure import SUFFIXES
-from dt_viz.ui.scene.film import MOTION, TURNTABLE, WARP
+from dt_viz.ui.scene.export import FORMATS, MOTION, RESOLUTIONS, TURNTABLE, WARP, Order
+from dt_viz.ui.scene.figure import Step
 from dt_viz.ui.tabs.about import Command
-from dt_viz.ui.tabs.saving import SaveButton, Step
+from dt_viz.warning import Severity
 
-LARGER = 1.4
-"""Factor by which the panel, its type and its controls are larger for a projector."""
-PNG, HTML = "PNG", "HTML"
-"""Names of the format that a browser renders, and of a page that replays the motion; others are lines and text."""
-VIDEOS = tuple(suffix[1:].upper() for suffix in VIDEO_SUFFIXES)
-"""Names of the formats of videos."""
-LARGEST_VIDEO = "1920 × 1080"
-"""Largest of the `RESOLUTIONS` that a video may have."""
+CANCEL = "Cancel"
+Make = Callable[[Session, Step, Cancelled], tuple[str, bytes]]
+"""Function that makes a file; it returns the suffix and the content, and raises FormatError where there is none."""
+
+
+class SaveButton:
+    """A button that makes and sends one file at a time; while it does so, it is the one that cancels that.
+
+    A bar below it shows progress, once a file's maker has told any.
+    """
+
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        bindings: Bindings,
+        label: str,
+        make: Make,
+        send: Callable[[str, bytes], None],
+        *,
+        icon: viser.IconName,
+        hint: str,
+    ) -> None:
+        """Build the button where the panel is being built; its lane of the session's jobs has this `label`."""
+        self._lane = self._label = label
+        self._make, self._send = make, send
+        self.button = gui.add_button(label, icon=icon, hint=hint)
+        self._bar = gui.add_progress_bar(0.0, visible=False, animated=True)
+        bindings.on(self.button, self._press)
+
+    def rename(self, label: str) -> None:
+        """Give the button another label, once it does not cancel."""
+        self._label = label
+        if self.button.label != CANCEL:
+            self.button.label = label
+
+    def _press(self, session: Session, _pressed: bool) -> None:
+        if session.jobs.busy(self._lane):
+            session.jobs.submit(self._lane, lambda: None, latest=True)
+        else:
+            session.jobs.submit(self._lane, partial(self._work, session))
+
+    def _work(self, session: Session) -> None:
+        cancelled = partial(session.jobs.superseded, self._lane)
+
+        def step(fraction: float) -> None:
+            end_if(cancelled)
+            checkpoint()
+            self._bar.value, self._bar.visible = 100 * fraction, True
+
+        label, self.button.label = self._label, CANCEL
+        try:
+            suffix, content = self._make(session, step, cancelled)
+            end_if(cancelled)
+            self._send(suffix, content)
+        except (FormatError, TimeoutError) as error:
+            session.say(f"{label}: {error}", Severity.WARNING)
+        finally:
+            self.button.label, self._bar.visible = self._label, False
+            self._bar.value = 0.0
+
+
+LARGER = 1.4  # factor by which the panel, its type and its controls are larger for a projector
+PNG = "PNG"
+VIDEOS = tuple(suffix[1:].upper() for suffix in VIDEO_SUFFIXES)  # names of the formats of videos
+LARGEST_VIDEO = "1920 × 1080"  # largest of the `RESOLUTIONS` that a video may have
 SAVE_PICTURE, SAVE_VIDEO = "Save picture", "Save video"
-Film = Callable[[str, str, str, Step, Cancelled], bytes]
-"""Function that makes a video of `MOTION`, `TURNTABLE` or `WARP`, with a suffix, of a resolution."""
 BACK, ON, END = "Previous", "Next", "End"
 
 
@@ -44,20 +98,12 @@ class PictureTab:
         bindings: Bindings,
         tripod: CameraController,
         presentation: Presentation,
-        *,
         darken: Callable[[bool], None],
         enlarge: Callable[[bool], None],
-        render: Callable[[str, bool, Cancelled], bytes],
-        draw: Callable[[str, Step], bytes],
-        record: Callable[[Step], bytes],
-        film: Film,
+        draw: Callable[[Order, Step, Cancelled], bytes],
         send: Callable[[str, bytes], None],
     ) -> None:
-        """Build the controls where the panel is being built.
-
-        `render` makes a PNG, of a resolution, and perhaps transparent, `draw` a file of lines with a suffix, `record` a
-        page that replays the motion, `film` a video.
-        """
+        """Build the controls where the panel is being built; `draw` makes a file, `send` sends it."""
         self._tripod = tripod
         gui.add_html(patches.ROW)
         Control(gui.add_button_group("View", (*VIEWS, HAND, HOME), hint="where the camera looks from"), tripod.view)
@@ -73,11 +119,10 @@ class PictureTab:
         self._dark = bindings.later(dark, lambda _session, on: darken(on))
         big = box("Big type", "larger type and controls in a wider panel, to be read from afar")
         self._big = Control(big, enlarge)
-        on_press(
-            gui.add_button("Presentation", icon=viser.Icon.PRESENTATION, hint="the scene and a caption alone"),
-            lambda: presentation.show(True),
-        )
-        formats = PNG, *(suffix[1:].upper() for suffix in SUFFIXES), HTML, *VIDEOS
+        hint = "the scene and a caption alone"
+        alone = gui.add_button("Presentation", icon=viser.Icon.PRESENTATION, hint=hint)
+        Control(alone, lambda _pressed: presentation.show(True))
+        formats = tuple(suffix[1:].upper() for suffix in FORMATS)
         hint = (
             "PNG: the scene as you see it; SVG, PDF: lines and text for a paper, seen from the plane of the task; HTML:"
             " a page that plays the motion, and can be turned, without a server or network; MP4, GIF: a video"
@@ -91,14 +136,10 @@ class PictureTab:
         self._resolution = Control(gui.add_dropdown("Resolution", tuple(RESOLUTIONS), hint="of the PNG, pixels"))
         self._transparent = Control(gui.add_checkbox("Transparent", False, hint="the PNG has no background"))
 
-        def make(session: Session, step: Step, cancelled: Cancelled) -> tuple[str, bytes]:
-            if self._format.value == PNG:
-                return ".png", render(self._resolution.value, self._transparent.value, cancelled)
-            suffix = f".{self._format.value.lower()}"
-            if self._format.value in VIDEOS:
-                return suffix, film(self._what.value, suffix, self._resolution.value, step, cancelled)
-            with session.engine.refining(cancelled):
-                return suffix, record(step) if self._format.value == HTML else draw(suffix, step)
+        def make(_session: Session, step: Step, cancelled: Cancelled) -> tuple[str, bytes]:
+            suffix, size = f".{self._format.value.lower()}", RESOLUTIONS[self._resolution.value]
+            is_clear = self._transparent.value and self._format.value == PNG
+            return suffix, draw(Order(suffix, size, is_clear, self._what.value), step, cancelled)
 
         hint = "of the scene, as a file; press again to cancel"
         self._save = SaveButton(gui, bindings, SAVE_PICTURE, make, send, icon=viser.Icon.CAMERA, hint=hint)
@@ -110,14 +151,13 @@ class PictureTab:
         return [
             Command("Frame: move the camera back", lambda _: self._tripod.view(), "F"),
             *views,
-            Command("Orbit: turn the camera slowly, or stop", lambda _: switch(self._orbit), "O"),
-            Command("Lock the camera, or let it go", lambda _: switch(self._lock), "L"),
-            Command("Theme: dark, or light", lambda _: switch(self._dark), "T"),
-            Command("Big type for a projector, or the usual one", lambda _: switch(self._big), "B"),
+            Command("Orbit: turn the camera slowly, or stop", lambda _: self._orbit.switch(), "O"),
+            Command("Lock the camera, or let it go", lambda _: self._lock.switch(), "L"),
+            Command("Theme: dark, or light", lambda _: self._dark.switch(), "T"),
+            Command("Big type for a projector, or the usual one", lambda _: self._big.switch(), "B"),
         ]
 
     def _choose(self, chosen: str) -> None:
-        """Show what there is to choose of a format."""
         is_video, resolutions = chosen in VIDEOS, tuple(RESOLUTIONS)
         self._transparent.handle.visible = chosen == PNG
         self._what.handle.visible = is_video

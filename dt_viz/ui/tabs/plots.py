@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
@@ -15,28 +17,84 @@ from viser import uplot
 from dt_viz.flows.fields import Array
 from dt_viz.metrics import arc_length
 from dt_viz.motion.following import ArmMotion
+from dt_viz.motion.profiles import NUM_SAMPLES as NUM_OF_PROFILE
 from dt_viz.motion.profiles import Profiles
 from dt_viz.robot.robot import Robot
-from dt_viz.session.frame import Frame
+from dt_viz.session.frame import Compared, Frame
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.playback import Replay
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.palette import Colour, css
 from dt_viz.ui.scene.picture import Following
-from dt_viz.ui.tabs.data import SAVE, joints_table, path_table, table_csv
+
+SAVE = "Save data"  # label of the buttons that save them
+
+
+def table_csv(table: Mapping[str, Sequence[object] | Array]) -> bytes:
+    """Return a table as CSV: columns (N,) of numbers or texts by their heads, numbers with nine digits."""
+    file = io.StringIO()
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow(table)
+    for row in zip(*table.values(), strict=True):
+        writer.writerow([f"{value:.9g}" if isinstance(value, float) else value for value in row])
+    return file.getvalue().encode()
+
+
+def joints_table(motion: ArmMotion, robot: Robot) -> dict[str, Array]:
+    """Return the angles and the speeds of a motion's joints, at its own samples; speeds are those until the next."""
+    speeds = np.diff(motion.q, axis=0) / np.maximum(np.diff(motion.times), 1e-9)[:, None]
+    columns: dict[str, Array] = {"time_s": motion.times}
+    columns |= {f"{name}_deg": angles for name, angles in zip(robot.joint_names, np.degrees(motion.q).T, strict=True)}
+    used = 100 * np.vstack([np.abs(speeds) / robot.velocity_limits, np.zeros((1, robot.num_joints))])
+    return columns | {f"{name}_speed_percent": speed for name, speed in zip(robot.joint_names, used.T, strict=True)}
+
+
+def path_table(profiles: Profiles) -> dict[str, Array]:
+    """Return how the shown motion, and the one without behaviours, fare along the path, from 0 to 1."""
+    columns: dict[str, Array] = {"path": profiles.along}
+    for suffix, profile in (("", profiles.shown), ("_without", profiles.undisturbed)):
+        columns[f"lyapunov{suffix}"] = profile.lyapunov
+        columns[f"distance_mm{suffix}"] = 1e3 * profile.distance
+        columns[f"clearance_mm{suffix}"] = 1e3 * profile.clearance
+    return columns
+
+
+def scores_table(comparison: Sequence[Compared]) -> dict[str, list[object]]:
+    """Return the scores of compared methods, each a row; no score is an empty text."""
+    scores = [compared.scores for compared in comparison]
+    names = {
+        "to_demo_mm": "frechet",
+        "hand_in_mm": "hand_depth",
+        "arm_in_mm": "arm_depth",
+        "off_goal_mm": "goal_error",
+    }
+    table: dict[str, list[object]] = {"method": [compared.method.title for compared in comparison]}
+    for head, name in names.items():
+        values = [None if score is None else getattr(score, name) for score in scores]
+        table[head] = ["" if value is None else 1e3 * float(value) for value in values]
+    table["note"] = [compared.note for compared in comparison]
+    return table
+
+
+def curves_table(comparison: Sequence[Compared]) -> dict[str, Array]:
+    """Return the curves of compared methods along the path, from 0 to 1; of those that have some."""
+    columns: dict[str, Array] = {"path": np.linspace(0, 1, NUM_OF_PROFILE)}
+    for compared in comparison:
+        if compared.curves is not None:
+            columns[f"{compared.method.name}_distance_mm"] = 1e3 * compared.curves[:, 0]
+            columns[f"{compared.method.name}_depth_mm"] = 1e3 * compared.curves[:, 1]
+    return columns
+
 
 NUM_SAMPLES, RATE = 80, 10
 """Number of samples of a curve over time, few enough to be sent during a drag, and of a long one for each second."""
-LARGE = 1.4
-"""Factor by which plots in windows of their own are higher."""
+LARGE = 1.4  # factor by which plots in windows of their own are higher
 WIDTH, BESIDE = 560.0, -350.0
 """Width of these windows, and their place from the right, where the panel is, CSS pixels."""
-LEFT, RIGHT = 42, 12
-"""Room beside the curves of a plot, CSS pixels."""
+LEFT, RIGHT = 42, 12  # room beside the curves of a plot, CSS pixels
 Axis = Literal["time", "path"]
-ACROSS: Mapping[Axis, str] = {"time": "t [s]", "path": "path"}
-"""Names of what is across the plots."""
+ACROSS: Mapping[Axis, str] = {"time": "t [s]", "path": "path"}  # names of what is across the plots
 MAX_SPEED = 200
 """Largest speed in the plot, percent of the joint's limit: a joint that leaps would flatten all other curves."""
 
@@ -121,12 +179,9 @@ def _pale(text: str) -> str:
 class JointCurves:
     """Curves of the plots of the joints."""
 
-    times: Array
-    """(N,) even times, seconds."""
-    angles: Array
-    """(N, n) joint angles, degrees, unwrapped."""
-    speeds: Array
-    """(N, n) joint speeds, percent of the velocity limits."""
+    times: Array  # (N,) even times, seconds
+    angles: Array  # (N, n) joint angles, degrees, unwrapped
+    speeds: Array  # (N, n) joint speeds, percent of the velocity limits
 
 
 def joint_curves(motion: ArmMotion, robot: Robot) -> JointCurves:
@@ -232,8 +287,7 @@ class Plots:
         self._motion: ArmMotion | None = None
         self._path: Array | None = None
         """Path of the hand (T, 3) along which the health is plotted, metres."""
-        self._past: ArmMotion | None = None
-        """What the robot did, while that is shown."""
+        self._past: ArmMotion | None = None  # what the robot did, while that is shown
         self._profiles: Profiles | None = None
         for name, kind, made in (("joint_plots", JointPlots, self.joints), ("health_plots", HealthPlots, self.health)):
             bindings.checkbox(gui, name)

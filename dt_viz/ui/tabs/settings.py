@@ -14,8 +14,7 @@ from dt_viz.avoidance.transform import Transform
 from dt_viz.flows.diffeomorphisms import MAX_STEPS, Method
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import transform_of, with_transform
-from dt_viz.ui.bindings import KEEP, Bindings, Handle, Read, Value
-from dt_viz.ui.controls import Control
+from dt_viz.ui.bindings import KEEP, Bindings, Control, Handle, Read, Value
 
 Chosen = Callable[[Scenario], str | None]
 """Function that returns the name of the layer whose settings are shown; None where there is none."""

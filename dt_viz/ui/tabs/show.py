@@ -41,8 +41,7 @@ class ShowTab:
     def __init__(self, gui: viser.GuiApi, bindings: Bindings, send: Callable[[str, bytes], None]) -> None:
         """Build the controls where the panel is being built; `send` gets the end of a file's name, and its content."""
         self._bindings = bindings
-        self.legend: Legend | None = None
-        """Legend of the colours that are shown on the slice."""
+        self.legend: Legend | None = None  # legend of the colours that are shown on the slice
         self._add_slice(gui, bindings)
         self.plots = Plots(gui, bindings, send)  # high up in the tab, to be seen when it opens
         self.timeline = Timeline(gui, bindings, self.plots)
@@ -56,7 +55,6 @@ class ShowTab:
         bindings.slider(gui, "generator_layer", visible=lambda s: s.view.generator, max=num_flows)
 
     def _add_slice(self, gui: viser.GuiApi, bindings: Bindings) -> None:
-        """Add the controls of the slice, with a legend of its colours."""
         bindings.checkbox(gui, "move_slice")
         self.back = gui.add_button("Back to the task's slice", visible=False, hint="where it was before it was moved")
         bindings.on(self.back, _put_back, visible=lambda s: s.view.slice is not None)
@@ -73,7 +71,8 @@ class ShowTab:
         self.key = gui.add_html("", visible=False)
         bindings.show(self._legend_of, self._explain)
         self.note = gui.add_html(small(WHOLE_ARM_NOTE), visible=False)
-        bindings.properties(self.note, visible=_lacks_whole_arm)
+        lacks_arm = lambda s: _shows_velocities(s) and s.arm_avoidance is not None and bool(s.obstacles)  # noqa: E731
+        bindings.properties(self.note, visible=lacks_arm)
 
     def _legend_of(self, scenario: Scenario) -> Legend | None:
         """Return the legend of the view's colours; `KEEP` until their picture is there."""
@@ -100,8 +99,3 @@ def _shows_velocities(scenario: Scenario) -> bool:
     """Whether the slice shows something of the vector field or of ψ."""
     view = scenario.view
     return view.colour != "none" or view.field or view.streamlines or view.grid
-
-
-def _lacks_whole_arm(scenario: Scenario) -> bool:
-    """Whether the slice shows something that the whole arm's avoidance would change."""
-    return _shows_velocities(scenario) and scenario.arm_avoidance is not None and bool(scenario.obstacles)

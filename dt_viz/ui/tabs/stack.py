@@ -18,8 +18,8 @@ from dt_viz.avoidance.registry import AVOIDANCE, entry_of
 from dt_viz.avoidance.transform import Transform
 from dt_viz.learning.imitation import OBJECTIVES
 from dt_viz.learning.state import STATES
-from dt_viz.scenario.panels import BASE_PANEL
 from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.slices import BASE_PANEL
 from dt_viz.scenario.stack import (
     IMITATION,
     WHOLE_ARM,
@@ -35,8 +35,7 @@ from dt_viz.scenario.stack import (
 from dt_viz.scenario.tasks import STYLES
 from dt_viz.session.frame import Frame
 from dt_viz.session.session import Session
-from dt_viz.ui.bindings import Bindings
-from dt_viz.ui.controls import Control
+from dt_viz.ui.bindings import Bindings, Control
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.palette import Colour
 from dt_viz.ui.scene.rollouts import manifold
@@ -46,8 +45,7 @@ from dt_viz.ui.tabs.settings import add_settings, settings_of_purpose
 BASE = "Base attractor"
 ON, OFF, UP, DOWN, SHOW, SHOWN = "● on", "○ off", "↑", "↓", "show", "● shown"
 WARP, PLAY = "Warp", "▶ 0 → 1"
-SECONDS = 5.0
-"""Duration of playing the warp."""
+SECONDS = 5.0  # duration of playing the warp
 NO_STYLE = "–"
 
 _COLOURS: Mapping[type[Transform], Colour] = {Avoidance: palette.LIGHT.obstacle, BiasPoint: palette.LIGHT.bias}

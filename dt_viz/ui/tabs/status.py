@@ -40,12 +40,10 @@ COLOURS: Mapping[Severity | None, tuple[Colour, Colour]] = {
 }
 """Ink and paper of each severity, and those of what is not known yet."""
 PALE = "opacity:0.3;filter:grayscale(1)"
-LEADING = 1.35 * 0.8
-"""Height of a line of small text, em."""
+LEADING = 1.35 * 0.8  # height of a line of small text, em
 HINT, REASON, BUTTON = 3.3, 4.5, 2.25
 """Heights of the places of the hint and of the reason, and of a button in the latter, em."""
-DETAILS = 11
-"""Largest height of the details, em: on a laptop the tabs below them stay in sight."""
+DETAILS = 11  # largest height of the details, em: on a laptop the tabs below them stay in sight
 ROWS: Mapping[str, str] = {
     "Rebuild": "Time from the last change until its motion was shown. Changes that a newer one overtook are skipped.",
     "Clearance": "Smallest distance from the obstacles of what gives way to them: the end effector, or the body points "
@@ -75,8 +73,7 @@ WARP_HINT = "at warp {:.2f} each flow has run for that part of its time, so noth
 class Verdict:
     """What the status says."""
 
-    line: str
-    """One line of figures, such as "✓ safe · 9 mm · stable · 12 ms"."""
+    line: str  # one line of figures, such as "✓ safe · 9 mm · stable · 12 ms"
     severity: Severity = Severity.GOOD
     reason: str = ""
     """The one reason that matters most, or that every check holds; empty while that is not known."""
@@ -163,8 +160,7 @@ def _clearance_text(frame: Frame, view: View) -> str:
 class Remedy:
     """An edit that mends something."""
 
-    label: str
-    """Label of its button."""
+    label: str  # label of its button
     changes: Mapping[str, Any] | None
     """Fields of the scenario that it replaces; None where it takes the last step back."""
 

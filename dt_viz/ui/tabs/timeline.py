@@ -10,12 +10,10 @@ from typing import Any
 import viser
 
 from dt_viz.scenario.scenario import OFFERS
-from dt_viz.session.recording import SPAN
 from dt_viz.session.session import Session
 from dt_viz.ui import patches
-from dt_viz.ui.bindings import Bindings
-from dt_viz.ui.controls import Control
-from dt_viz.ui.playback import Playback, Replay
+from dt_viz.ui.bindings import Bindings, Control
+from dt_viz.ui.playback import SPAN, Playback, Replay
 from dt_viz.ui.tabs.about import Command
 from dt_viz.ui.tabs.arm import play_or_pause
 from dt_viz.ui.tabs.plots import Plots, cursor_html
@@ -24,8 +22,7 @@ from dt_viz.warning import Severity
 LIVE, REPLAY, PAST = "Live", "Replay", f"Last {SPAN:.0f} s"
 """What is shown: the robot, its finished motion, and what it did."""
 BACK, PLAY, PAUSE, ON = "◂ Step", "Play", "Pause", "Step ▸"
-WIDTH = 340.0
-"""Width of the window, CSS pixels."""
+WIDTH = 340.0  # width of the window, CSS pixels
 
 
 class Timeline:
@@ -118,8 +115,6 @@ class Timeline:
         return None if self._playback is None else self._playback.player
 
     def _on(self, handle: Any, act: Callable[[Replay, Any], None]) -> Control:  # noqa: ANN401 - viser's of all kinds
-        """Let an input act on what is played."""
-
         def acts(_session: Session, value: Any) -> None:  # noqa: ANN401
             player = self._player
             if player is not None:

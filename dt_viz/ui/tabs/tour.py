@@ -24,14 +24,11 @@ TAKE, DECLINE = "Take the tour", "No, thanks"
 BACK, NEXT, END = "Back", "Next", "End"
 KEY = "dt-viz-tour"
 """Key under which a browser keeps the number of the step that is shown, from 1, or `OVER`."""
-PAPER = "rgba(0, 158, 115, 0.10)"
-"""Colour behind the text, on light and on dark."""
-OVER = "over"
-"""Text that a browser keeps once the tour is ended or declined."""
+PAPER = "rgba(0, 158, 115, 0.10)"  # colour behind the text, on light and on dark
+OVER = "over"  # text that a browser keeps once the tour is ended or declined
 NUMBERS = tuple(str(number) for number in range(1, len(STEPS) + 1))
 """Numbers of the steps, as a browser or a link tells them."""
-LANE = "tour"
-"""Lane of the session's jobs on which the browser is asked, and the tour begins."""
+LANE = "tour"  # lane of the session's jobs on which the browser is asked, and the tour begins
 Begin = Callable[[Callable[[Session, str], None], Session, str], None]
 """Function that begins something of a session, with a title; see `ControlPanel.choose`."""
 
@@ -61,8 +58,7 @@ class Tour:
         self._tripod, self._begin, self._storage, self._came_back = tripod, begin, storage, came_back
         self.number: int | None = None
         """Number of the step that is shown, from 0; None outside the tour."""
-        self.pose: Pose | None = None
-        """Pose that the camera had before the tour; None as it began."""
+        self.pose: Pose | None = None  # pose that the camera had before the tour; None as it began
         hint = "six steps, two minutes: from an attractor to a whole arm. What you have made stays as it is"
         self._offer = gui.add_button_group("New here?", (TAKE, DECLINE), visible=False, hint=hint)
         self._card = gui.add_html("")
@@ -172,7 +168,6 @@ class Tour:
             self._warp[1].act(PLAY)
 
     def _write(self) -> None:
-        """Show the text of the step, and what belongs to it."""
         step, number = self.step, self.number
         self._card.visible = self._arrows.visible = self._buttons.visible = step is not None
         for control in self._warp:
@@ -188,7 +183,6 @@ class Tour:
 
 
 def _stop_playing(session: Session) -> None:
-    """Stop what changes the scenario by itself."""
     player.stop(session)
     session.jobs.wait_idle(player.LANE)
 

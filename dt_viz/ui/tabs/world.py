@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
-from types import UnionType
 from typing import Any
 
 import numpy as np
@@ -14,11 +13,10 @@ import viser
 from dt_viz.avoidance import registry
 from dt_viz.avoidance.transform import Transform
 from dt_viz.motion.following import room_at_rest
-from dt_viz.obstacles import files as shapes
-from dt_viz.obstacles.shapes import ORIGIN, Box, CloudObstacle, Cylinder, MeshObstacle, Obstacle, Sphere, as_point
+from dt_viz.obstacles.shapes import SHAPES, Box, Length, Obstacle, as_point, primitives
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.inverse_kinematics import UnreachableError
-from dt_viz.scenario.scenario import MAX_DIAMETER, MAX_MARGIN, MAX_OBSTACLES, MIN_DIAMETER, Scenario
+from dt_viz.scenario.scenario import MAX_MARGIN, MAX_OBSTACLES, Scenario
 from dt_viz.scenario.stack import added, selected, surroundings, with_added, with_avoidance, without
 from dt_viz.scenario.starts import followed, label_of, with_grid, with_label
 from dt_viz.scenario.tasks import Task
@@ -28,13 +26,6 @@ from dt_viz.ui.tabs.from_file import FileLoader, has_room
 from dt_viz.ui.tabs.settings import add_settings, settings_of_purpose
 from dt_viz.warning import Severity
 
-SHAPES: Mapping[str, Obstacle] = {
-    "Sphere": Sphere(ORIGIN, 0.10),
-    "Cylinder": Cylinder(ORIGIN, 0.08, 0.16),
-    "Cube (fig. 3a)": Box(ORIGIN, (0.12, 0.12, 0.12)),
-    "Box": Box(ORIGIN, (0.16, 0.10, 0.06)),
-}
-"""Shapes that can be added, by the name of their button."""
 NONE: str = "none"
 NO_TRANSFORM = "–"
 NEAREST = "nearest"
@@ -45,66 +36,26 @@ LABEL_HINT = (
 )
 
 
-@dataclass(frozen=True)
-class _Length:
-    """A slider [cm] for a length of obstacles of one shape, metres."""
+def add_length(gui: viser.GuiApi, bindings: Bindings, which: Length) -> None:
+    """Build the slider [cm] of a length where the panel is being built; it is shown for the shapes that have it."""
 
-    label: str
-    shape: type[Obstacle] | UnionType
-    low: float
-    high: float
-    field: str
-    """Name of the shape's field."""
-    place: int | None = None
-    """Place of the length where the field is a tuple of them."""
-    hint: str | None = None
+    def has(obstacle: Obstacle | None) -> bool:
+        return obstacle is not None and which in obstacle.lengths
 
-    def add(self, gui: viser.GuiApi, bindings: Bindings) -> None:
-        """Build it where the panel is being built; it is shown while the selected obstacle has the shape."""
+    def shown(scenario: Scenario) -> float:
+        chosen = _selected(scenario)
+        return round(100 * chosen.length(which), 3) if chosen is not None and has(chosen) else KEEP
 
-        def shown(scenario: Scenario) -> float:
-            chosen = _selected(scenario)
-            if not isinstance(chosen, self.shape):
-                return KEEP
-            value = getattr(chosen, self.field)
-            return round(100 * (value if self.place is None else value[self.place]), 3)
+    def changed(scenario: Scenario, value: float) -> dict[str, Any]:
+        chosen, index, before = _selected(scenario), scenario.selected or 0, scenario.obstacles
+        if chosen is None or not has(chosen):
+            return {}
+        obstacles = (*before[:index], chosen.with_length(which, value / 100), *before[index + 1 :])
+        return {"stack": with_avoidance(scenario, obstacles=obstacles)}
 
-        def changed(scenario: Scenario, value: float) -> dict[str, Any]:
-            chosen = _selected(scenario)
-            if not isinstance(chosen, self.shape):
-                return {}
-            index, before = scenario.selected or 0, scenario.obstacles
-            changed = (*before[:index], self._with(chosen, value / 100), *before[index + 1 :])
-            return {"stack": with_avoidance(scenario, obstacles=changed)}
-
-        slider = gui.add_slider(self.label, 100 * self.low, 100 * self.high, 0.5, 15.0, hint=self.hint)
-        bindings.input(slider, shown, changed, visible=lambda s: isinstance(_selected(s), self.shape))
-
-    def _with(self, obstacle: Any, length: float) -> Obstacle:  # noqa: ANN401 - of the shape
-        if isinstance(obstacle, MeshObstacle | CloudObstacle):
-            return obstacle.resized(length)
-        before = getattr(obstacle, self.field)
-        lengths = length if self.place is None else (*before[: self.place], length, *before[self.place + 1 :])
-        return replace(obstacle, **{self.field: lengths})
-
-
-SIDE = 0.03, 0.40
-"""Smallest and largest side of a box, and height of a cylinder, metres."""
-LENGTHS = (
-    _Length("Diameter [cm]", Sphere, MIN_DIAMETER, MAX_DIAMETER, "diameter"),
-    _Length("Diameter [cm]", Cylinder, MIN_DIAMETER, MAX_DIAMETER, "diameter"),
-    _Length("Height [cm]", Cylinder, *SIDE, "height"),
-    *(_Length(f"Size {axis} [cm]", Box, *SIDE, "sizes", place) for place, axis in enumerate("xyz")),
-    _Length(
-        "Size [cm]",
-        MeshObstacle | CloudObstacle,
-        shapes.MIN_SIZE,
-        shapes.MAX_SIZE,
-        "size",
-        hint="largest side of its bounding box",
-    ),
-)
-"""Sliders for the lengths of all shapes."""
+    low, high = 100 * which.low, 100 * which.high
+    slider = gui.add_slider(f"{which.label} [cm]", low, high, 0.5, low, hint=which.hint)
+    bindings.input(slider, shown, changed, visible=lambda s: has(_selected(s)))
 
 
 def add_obstacles(gui: viser.GuiApi, bindings: Bindings) -> FileLoader:
@@ -119,14 +70,15 @@ def add_obstacles(gui: viser.GuiApi, bindings: Bindings) -> FileLoader:
             options=_names,
         )
         bindings.checkbox(gui, "handles")
-        group = gui.add_button_group("Add", tuple(SHAPES), hint=f"up to {MAX_OBSTACLES}, where there is room")
+        shapes = offered()
+        group = gui.add_button_group("Add", tuple(shapes), hint=f"up to {MAX_OBSTACLES}, where there is room")
         # groups of buttons cannot be disabled
-        bindings.later(group, lambda session, name: add(session, SHAPES[name]), visible=has_room)
+        bindings.later(group, lambda session, name: add(session, shapes[name]), visible=has_room)
         changes = {"Duplicate": duplicate, "Delete": delete}
         change = gui.add_button_group("Change", tuple(changes), hint="the selected obstacle")
         bindings.later(change, lambda session, name: changes[name](session), visible=lambda s: bool(s.obstacles))
-        for length in LENGTHS:
-            length.add(gui, bindings)
+        for which in dict.fromkeys(which for shape in SHAPES for which in shape.lengths):
+            add_length(gui, bindings, which)
         hint = "clearance that the automatic flow time keeps"
         bindings.input(
             gui.add_slider("Margin [cm]", 0.0, 100 * MAX_MARGIN, 0.1, 1.0, hint=hint),
@@ -134,6 +86,11 @@ def add_obstacles(gui: viser.GuiApi, bindings: Bindings) -> FileLoader:
             lambda s, value: {"stack": with_avoidance(s, margin=value / 100)},
         )
         return FileLoader(gui, bindings, add)
+
+
+def offered() -> dict[str, Obstacle]:
+    """Return the shapes that can be added, by the name of their button."""
+    return {name: of.of_extents(size) for of in primitives().values() for name, size in of.offered.items()}
 
 
 def add(session: Session, obstacle: Obstacle) -> None:
