@@ -23,7 +23,7 @@ import pytest
 import viser  # noqa: TID251 - whose version the page has
 import websockets.sync.client
 from pages import asynchronous, come_true, wait_until
-from protocol_client import OBSTACLE, ROLLOUT, LostError, ProtocolClient
+from protocol_client import OBSTACLE, LostError, ProtocolClient
 from viser._messages import ResetGuiMessage  # noqa: TID251
 from viser.infra._async_message_buffer import AsyncMessageBuffer  # noqa: TID251
 from websockets.asyncio.client import connect
@@ -170,13 +170,9 @@ async def test_prometheus_is_told_what_visitors_do_and_nobody_is_under_a_foreign
     async with visiting(url) as client:
         visitor = await only_visitor(server)
         assert await asyncio.to_thread(visitor.session.wait_idle, PATIENCE)
-        (_, before), num_edits, shown = (
-            await told(),
-            visitor.session._screen.num_edits,
-            client.nodes[ROLLOUT]["vertices"],
-        )
+        (_, before), num_edits = await told(), visitor.session._screen.num_edits
         await client.set("Warp", 0.5)
-        assert await client.wait_for(lambda: client.nodes[ROLLOUT]["vertices"] is not shown, PATIENCE)
+        await come_true(lambda: visitor.shown is not None and visitor.shown.scenario.warp == 0.5)
         assert await asyncio.to_thread(visitor.session.wait_idle, PATIENCE)
         status, after = await told()
     assert await status_of(url, origin="https://evil.example") == 403
