@@ -190,7 +190,7 @@ BUDGET: Mapping[str, tuple[int, int]] = {
     "avoidance": (2411, 15),
     "baselines": (1096, 9),
     "control": (1263, 6),
-    "evaluate": (1486, 8),
+    "evaluate": (1441, 8),
     "examples": (200, 5),
     "files": (2822, 19),
     "flows": (1295, 8),
@@ -204,9 +204,9 @@ BUDGET: Mapping[str, tuple[int, int]] = {
     "scenario": (2539, 14),
     "serving": (506, 3),
     "session": (2987, 15),
-    "tests": (37184, 190),
+    "tests": (37182, 190),
     "ui": (10898, 48),
-    "whole": (44500, 237),
+    "whole": (44455, 237),
 }
 """Largest numbers of lines and of files of each package; "" has the modules of none. They only go down."""
 SLACK = 0.02  # part of a budget of lines that may be unused before the budget goes down, too

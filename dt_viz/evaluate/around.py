@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,7 +19,6 @@ from scipy.spatial.transform import Rotation
 from dt_viz.avoidance.avoidance import SPACES, Avoidance
 from dt_viz.evaluate import options as shared
 from dt_viz.evaluate.held_out import frechet
-from dt_viz.evaluate.options import Made, add_workers, computed
 from dt_viz.flows.fields import Array
 from dt_viz.flows.rollouts import refined
 from dt_viz.metrics import interpolate, maximum_collision_distance, sharpest_turn
@@ -38,7 +36,8 @@ from dt_viz.warning import Kind, MotionWarning
 TURN_ARC = 0.015  # m of the path over which a turn is measured
 ALLOWANCE = 1e-3  # shortfall of a clearance, metres, with which the margin counts as kept
 CLEARANCES = ("hand", "arm", "hand_without", "arm_without")
-FIGURES = (*CLEARANCES, "frechet", "detour", "goal_miss", "turn", "turn_without", "num_outside")  # of a rollout
+FIGURES = ("hand", "arm", "turn", "hand_without", "arm_without", "turn_without")
+FIGURES += ("frechet", "detour", "goal_miss", "num_outside")  # of a rollout
 
 
 @dataclass(frozen=True)
@@ -66,25 +65,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", "--diameter", type=sizes, default=(0.15, 0.15), metavar="LOW[,HIGH]", help=size)
     along = "part of the mean demonstration's length, from 0 to 1, that they are spread along (default: 0.5)"
     parser.add_argument("--along", type=shared.interval(0, 1), default=(0.5, 0.5), metavar="FROM[,TO]", help=along)
-    spread = "largest distance of an obstacle from there, metres (default: 0.05)"
-    parser.add_argument("--spread", type=shared.numbers("metres, 0 to 1", 0, 1), default=(0.05,), help=spread)
+    spread = f"largest distance of an obstacle from there, metres {default}"
+    parser.add_argument("--spread", type=shared.numbers("metres, 0 to 1", 0, 1), default=0.05, help=spread)
     space = f"what avoids: the end effector (task) or the whole arm (cspace) {default}"
     parser.add_argument("--space", choices=SPACES, default="cspace", help=space)
     generator = f"probability is the paper's {default}"
     parser.add_argument("--generator", choices=GENERATORS, default=GENERATORS[0], help=generator)
     parser.add_argument("--no-avoidance", action="store_true", help="leave the obstacle's transforms out")
-    parser.add_argument("--out", type=shared.output(".npz"), required=True, metavar="FILE.npz", help="what is written")
-    add_workers(parser)
+    shared.add_output(parser, ".npz")
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the command; 1 if the one obstacle that was asked for leaves no motion."""
     task = shared.chosen_task(options)
-    name, on, chosen = task.name, not options.no_avoidance, {"space": options.space, "generator": options.generator}
-    engine, around = Made(lambda: shared.engine_of(task)), _drawn(task, options)
-    arrays, cases = _as_arrays(around, len(around[-1])), [Avoidance(tuple(obstacles), **chosen) for obstacles in around]
+    name, on, around = task.name, not options.no_avoidance, _drawn(task, options)
+    engine, arrays = shared.Made(lambda: shared.engine_of(task)), _as_arrays(around)
+    cases = [Avoidance(tuple(each), space=options.space, generator=options.generator) for each in around]
     try:
-        places = [*computed(options, lambda case: measured(engine(), engine().task(name), case, on=on), cases)]
+        places = [*shared.computed(options, lambda case: measured(engine(), engine().task(name), case, on=on), cases)]
     except UnreachableError as error:
         print(f"no motion: the arm cannot reach the starts: {error}", file=sys.stderr)
         return 1
@@ -94,9 +92,9 @@ def run(options: argparse.Namespace) -> int:
             print(f"no motion: {reason}", file=sys.stderr)
         return 1
     figures, default = np.stack([place.figures for place in places]), cases[0]
-    no_way = [any(reason.kind is Kind.NO_WAY for reason in place.blocked) for place in places]
-    arrays |= {"ends": np.stack([place.ends for place in places]), "no_way": np.array(no_way)}
-    arrays |= {"blocked": np.array([bool(place.blocked) for place in places])}
+    reasons = [[reason.kind for reason in place.blocked] for place in places]
+    arrays |= {"ends": np.stack([place.ends for place in places]), "blocked": np.array([*map(bool, reasons)])}
+    arrays |= {"no_way": np.array([Kind.NO_WAY in kinds for kinds in reasons])}
     arrays |= {figure: figures[..., f] for f, figure in enumerate(FIGURES)}
     by_name = {f"place {k}": of_place for k, of_place in enumerate(figures)}
     if options.obstacle:
@@ -112,7 +110,7 @@ def run(options: argparse.Namespace) -> int:
     for place in places:
         for warning in (*place.blocked, *place.warnings)[: None if options.obstacle else 1]:
             print(f"warning: {warning}")
-    shared.report([{"figure": label, "value": value} for label, value in _shares(arrays, figures, default)])
+    shared.report([{"figure": label, "value": value} for label, value in _shares(arrays, figures, default).items()])
     return 0
 
 
@@ -134,20 +132,17 @@ def measured(engine: Engine, task: Task, avoidance: Avoidance, *, on: bool = Tru
     else:
         paths = {i: robot.end_effector(motion.q) for i, motion in motions.items()}
         without = {i: robot.end_effector(motion.without) for i, motion in motions.items()}
+
+    def alone(x: Array, q: Array) -> tuple[float, float, float]:
+        nearest = robot.collision.nearest_to_obstacle(q, obstacle).distance
+        return _clearance(x, obstacle), nearest, sharpest_turn(x, TURN_ARC)
+
     for i, motion in motions.items():
         outside = (motion.q < robot.lower - rounding) | (motion.q > robot.upper + rounding)
-        figures[i] = (
-            _clearance(paths[i], obstacle),
-            robot.collision.nearest_to_obstacle(motion.q, obstacle).distance,
-            _clearance(without[i], obstacle),
-            robot.collision.nearest_to_obstacle(motion.without, obstacle).distance,
-            frechet([paths[i]], [task.paths[i]])[0],
-            frechet([paths[i]], [without[i]])[0],
-            np.linalg.norm(paths[i][-1] - frame.goal),
-            sharpest_turn(paths[i], TURN_ARC),
-            sharpest_turn(without[i], TURN_ARC),
-            outside.any(axis=1).sum(),
-        )
+        apart = [frechet([paths[i]], [other])[0] for other in (task.paths[i], without[i])]
+        missed = np.linalg.norm(paths[i][-1] - frame.goal)
+        both = (*alone(paths[i], motion.q), *alone(without[i], motion.without))
+        figures[i] = (*both, *apart, missed, outside.any(axis=1).sum())
     return Place(ends, figures, motions, (), frame.certificates.warnings)
 
 
@@ -166,7 +161,7 @@ def _finely(solution: Solution) -> tuple[Array, ...]:
 def _drawn(task: Task, options: argparse.Namespace) -> list[list[Primitive]]:
     """Draw the obstacles: of the first place one, and those of each random place."""
     count, number = (0, 1) if options.obstacle else (options.count, options.number)
-    (low, high), (begin, end), (spread,), path = options.size, options.along, options.spread, task.mean_path
+    (low, high), (begin, end), path = options.size, options.along, task.mean_path
     on_path = lambda part: interpolate(part * (len(path) - 1), np.arange(len(path)), path)  # noqa: E731
     middle = options.obstacle or on_path(np.array([begin + end]) / 2)[0]
     kind = "sphere" if options.shape == "any" else options.shape
@@ -174,7 +169,7 @@ def _drawn(task: Task, options: argparse.Namespace) -> list[list[Primitive]]:
     places += [[] for _ in range(count)]
     for nth in range(number if count else 0):
         rng = np.random.default_rng(options.seed + 1_000_003 * nth)  # not the seed of another place
-        offset = in_ball(rng, spread, count)
+        offset = in_ball(rng, options.spread, count)
         centres, sizes = on_path(rng.uniform(begin, end, size=count)) + offset, rng.uniform(low, high, size=(count, 3))
         turns = np.roll(Rotation.from_rotvec(np.pi * rng.normal(size=(count, 3))).as_quat(), 1, axis=1)
         kinds = rng.choice([*primitives()], size=count) if options.shape == "any" else [kind] * count
@@ -187,9 +182,9 @@ def _obstacle(kind: str, centre: Array, sizes: Array, wxyz: Array) -> Primitive:
     return primitives()[kind].of_extents(as_point(sizes), as_point(centre), as_quaternion(wxyz))
 
 
-def _as_arrays(places: Sequence[Sequence[Primitive]], number: int) -> dict[str, Array]:
-    """Arrays of the file, of the obstacles of each place (K + 1, number); that of the first is repeated."""
-    drawn = [(number * [*of_place])[:number] for of_place in places]
+def _as_arrays(places: Sequence[Sequence[Primitive]]) -> dict[str, Array]:
+    """Arrays of the file, of the obstacles of each place (K + 1, N); that of the first is repeated."""
+    drawn = [len(places[-1]) * [*places[0]], *places[1:]]
     arrays = {"places": "position", "sizes": "extents", "turns": "wxyz"}
     found = {name: np.array([[getattr(one, field) for one in of] for of in drawn]) for name, field in arrays.items()}
     return found | {"shapes": np.array([[type(one).__name__.lower() for one in of_place] for of_place in drawn])}
@@ -235,27 +230,27 @@ def _row(name: str, figures: Array, avoidance: Avoidance) -> shared.Row:
     }
 
 
-def _shares(arrays: Mapping[str, Array], figures: Array, avoidance: Avoidance) -> Iterator[tuple[str, str]]:
+def _shares(arrays: Mapping[str, Array], figures: Array, avoidance: Avoidance) -> dict[str, str]:
     """Shares of the places, and medians over them."""
     has, free = np.isfinite(arrays["frechet"]), arrays["ends"] >= 0
     moved = has.any(axis=1) & (free[:, :-1] | ~has).all(axis=1) & free[:, -1]
+    found = {
+        "places that leave the end effector's starts and goal free": free.all(axis=1),
+        "blocked": arrays["blocked"],
+        "blocked between free ends": arrays["no_way"],
+    }
     clearance, _, ratio = _clearances(figures[moved], avoidance)
-    margin = avoidance.margin - ALLOWANCE
-
-    def share(label: str, found: Any) -> tuple[str, str]:  # noqa: ANN401 - truths (K,)
-        return label, f"{found.sum()} of {len(found)} ({100 * found.mean():.1f} %)"
-
-    yield share("places that leave the end effector's starts and goal free", free.all(axis=1))
-    yield share("blocked", arrays["blocked"])
-    yield share("blocked between free ends", arrays["no_way"])
-    if not moved.any():
-        return
-    yield share("from some of the starts only", ~has[moved].all(axis=1))
-    yield share("collisions", clearance < 0)
-    yield share(f"at least {1e3 * margin:.0f} mm kept", clearance >= margin)
-    yield share("turns sharper than 90°", worst(figures[moved], "turn") > 90)
-    yield share("the same without avoidance", worst(figures[moved], "turn_without") > 90)
-    if len(ratio := ratio[ratio > 0]):
-        label = "detour/forced where a motion is in the way, median, 95 %"
-        yield label, "{:.2f}, {:.2f}".format(*np.percentile(ratio, [50, 95]))
-    yield "F.D. mean mm", f"{1e3 * np.nanmean(arrays['frechet'][moved]):.1f}"
+    kept, others = avoidance.margin - ALLOWANCE, {}
+    if moved.any():
+        found |= {
+            "from some of the starts only": ~has[moved].all(axis=1),
+            "collisions": clearance < 0,
+            f"at least {1e3 * kept:.0f} mm kept": clearance >= kept,
+            "turns sharper than 90°": worst(figures[moved], "turn") > 90,
+            "the same without avoidance": worst(figures[moved], "turn_without") > 90,
+        }
+        if len(ratio := ratio[ratio > 0]):
+            label = "detour/forced where a motion is in the way, median, 95 %"
+            others[label] = "{:.2f}, {:.2f}".format(*np.percentile(ratio, [50, 95]))
+        others["F.D. mean mm"] = f"{1e3 * np.nanmean(arrays['frechet'][moved]):.1f}"
+    return {label: f"{of.sum()} of {len(of)} ({100 * of.mean():.1f} %)" for label, of in found.items()} | others

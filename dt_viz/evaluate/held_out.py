@@ -34,7 +34,7 @@ Learn = Callable[[Sequence[Demonstration]], AnyImitation]
 
 @dataclass(frozen=True)
 class Followed:
-    """A demonstration that was held out, and the motions that follow it."""
+    """A demonstration, and the motions that follow it."""
 
     number: int  # of the demonstration
     demonstration: Demonstration
@@ -48,8 +48,8 @@ class Followed:
 
     def rms(self, way: str) -> float:
         """Return the root mean square distance at equal times, metres."""
-        (path, times), demonstrated = self.motions[way], self.demonstration
-        return rms_at_equal_times(times, path, demonstrated.times - demonstrated.times[0], demonstrated.positions)
+        path, times = self.motions[way]
+        return rms_at_equal_times(times, path, self.demonstration.times, self.demonstration.positions)
 
 
 def folds_of(num: int, folds: int) -> list[range]:
@@ -58,18 +58,20 @@ def folds_of(num: int, folds: int) -> list[range]:
 
 
 def follow(demonstrations: Sequence[Demonstration], learn: Learn, held: range) -> list[Followed]:
-    """Follow the demonstrations of a fold in each of `WAYS`. Raises ImitationError where the others teach nothing."""
+    """Follow demonstrations in each of `WAYS`: those held out, by what the others teach; or else all, by all.
+
+    Raises ImitationError where these teach nothing.
+    """
     others = [demonstration for i, demonstration in enumerate(demonstrations) if i not in held]
     imitation, even = learn(others), np.linspace(0, 1, NUM_COMPARED)
     paths = np.stack([resample_by_arc_length(d.positions, NUM_COMPARED) for d in others])
-    durations = np.array([d.times[-1] - d.times[0] for d in others])
+    durations = np.array([d.times[-1] for d in others])
     progress = np.stack([_progress(d) for d in others])  # part of the way that lies behind at even times
     followed = []
-    for i in held:
+    for i in held or range(len(demonstrations)):
         start = demonstrations[i].positions[0]
         nearest = int(np.linalg.norm(paths[:, 0] - start, axis=1).argmin())
-        (rollout,), (times,) = rollouts_from(imitation, start[None])
-        motions = {"learned": (rollout, times)}
+        motions = {"learned": rollout_from(imitation, start)}
         for way, of in {"mean": slice(None), "nearest": slice(nearest, nearest + 1)}.items():
             moments = np.interp(even, progress[of].mean(axis=0), even)
             motions[way] = shifted_to(start, paths[of].mean(axis=0)), durations[of].mean() * moments
@@ -80,7 +82,7 @@ def follow(demonstrations: Sequence[Demonstration], learn: Learn, held: range) -
 
 def _progress(demonstration: Demonstration) -> Array:
     times, length = demonstration.times, arc_length(demonstration.positions)
-    return np.interp(np.linspace(times[0], times[-1], NUM_COMPARED), times, length / length[-1])
+    return np.interp(np.linspace(0, times[-1], NUM_COMPARED), times, length / length[-1])
 
 
 def degrees_off(
@@ -111,15 +113,12 @@ def _turns(poses: AugmentedImitation, demonstration: Demonstration) -> Array:
     return resample_by_arc_length(np.hstack([demonstration.positions, vectors]), NUM_COMPARED)[:, 3:]
 
 
-def rollouts_from(imitation: AnyImitation, starts: Array) -> tuple[Array, Array]:
-    """Return learned motions (R, T, d) from `starts` (R, d), metres, up to the goal, and their times (R, T), s."""
-    rollouts, all_times, system = [], [], imitation.system
-    for start in starts:
-        state = system.base.states(start)
-        (end,) = arrival_times(system, system.transform.forward(state)[None])
-        all_times.append(end * np.linspace(0.0, 1.0, 1000))
-        rollouts.append(system.rollout(state, all_times[-1])[:, : len(start)])
-    return np.stack(rollouts), np.stack(all_times)
+def rollout_from(imitation: AnyImitation, start: Array) -> tuple[Array, Array]:
+    """Return the learned motion (T, d) from a start (d,), metres, up to the goal, and its times (T,), s."""
+    system, state = imitation.system, imitation.system.base.states(start)
+    (end,) = arrival_times(system, system.transform.forward(state)[None])
+    times = end * np.linspace(0.0, 1.0, 1000)
+    return system.rollout(state, times)[:, : len(start)], times
 
 
 def arrival_times(system: DiffeomorphicSystem, z0: Array) -> Array:

@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dt_viz.errors import FormatError
-from dt_viz.evaluate.held_out import WAYS, Followed, Learn, degrees_off, folds_of, follow, frechet, rollouts_from
-from dt_viz.evaluate.options import add_workers, computed, output, report, whole_number, write_json, write_npz
+from dt_viz.evaluate.held_out import WAYS, Followed, Learn, folds_of, follow
+from dt_viz.evaluate.options import add_output, computed, report, whole_number, write_json, write_npz
 from dt_viz.files.archives import LASA_UNITS
 from dt_viz.flows.diffeomorphisms import min_det_jacobian, round_trip_error
 from dt_viz.flows.fields import Array
@@ -25,7 +25,6 @@ from dt_viz.learning.demonstrations import Demonstration, load_demonstrations
 from dt_viz.learning.imitation import OBJECTIVES, ImitationError, ImitationSettings, grown_grid
 from dt_viz.learning.interface import AnyImitation
 from dt_viz.learning.state import learn as learn_in_state
-from dt_viz.metrics import rms_at_equal_times
 from dt_viz.pictures import figures
 from dt_viz.pictures.figures import FigurePanel
 
@@ -57,8 +56,7 @@ class InSample(NamedTuple):
 
     row: dict[str, Any]  # of the table
     arrays: dict[str, Any]  # of the file
-    rollouts: Array  # (N, T, d) from each demonstration's start, metres
-    degrees: Sequence[Array]  # from the orientation of each demonstration, see `degrees_off`; empty without any
+    followed: Sequence[Followed]  # each demonstration
     choice: str  # state that was chosen, and why; empty where it was asked for
     warnings: Sequence[str]
 
@@ -72,8 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--state", choices=STATES, default=STATES[0], help="default: %(default)s")
     parser.add_argument("--leave-one-out", action="store_true", help="also follow each by what the others teach")
     parser.add_argument("--folds", type=whole_number(2), metavar="N", help="the same, held out in so many folds")
-    parser.add_argument("--out", type=output(), required=True, metavar="DIR", help="folder of what is written")
-    add_workers(parser)
+    add_output(parser)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -97,9 +94,10 @@ def run(options: argparse.Namespace) -> int:
             print(f"{source.path}: {warning}", file=sys.stderr)
         shapes.append(own.row)
         write_npz(folder / f"{name}.npz", own.arrays)
-        panels.append(FigurePanel(name, {"demonstration": source.paths, "learned": own.rollouts}))
-        if own.degrees:
-            turns.append(turn_row(name, own.degrees, followed))
+        learned = [f.motions["learned"][0] for f in own.followed]
+        panels.append(FigurePanel(name, {"demonstration": source.paths, "learned": learned}))
+        if any(f.degrees for f in own.followed):
+            turns.append(turn_row(name, own.followed, followed))
         if followed:
             write_npz(folder / f"{name}-held-out.npz", _arrays(followed, source.unit))
             held_out.append(summed_up(name, len(source.folds), followed))
@@ -147,34 +145,28 @@ def _measured(learn: Learn, case: tuple[Source, range | None]) -> Any:  # noqa: 
 
 def in_sample(imitation: AnyImitation, source: Source, fit_seconds: float) -> InSample:
     """Follow all demonstrations."""
-    paths, unit, demonstrations = source.paths, source.unit, source.demonstrations
-    rollouts, times = rollouts_from(imitation, np.stack([path[0] for path in paths]))
-    distances = 1e3 * frechet(list(rollouts), paths)
-    at_times = zip(times, rollouts, demonstrations, strict=True)
-    grid, transform = _states(imitation, paths), imitation.system.transform
-    round_trip, det = round_trip_error(transform, grid), min_det_jacobian(transform.jacobian, grid)
-    seconds = {
-        "fit_seconds": fit_seconds,
-        "start_seconds": float(np.median([_seconds_for(imitation, path[0]) for path in paths])),
-    }
+    followed = follow(source.demonstrations, lambda _: imitation, range(0))
+    distances, rollouts = [1e3 * f.frechet("learned") for f in followed], [f.motions["learned"] for f in followed]
+    grid, transform, unit = _states(imitation, source.paths), imitation.system.transform, source.unit
+    round_trip = round_trip_error(transform, grid)
     row = {
         "name": source.path.stem,
-        "demonstrations": len(paths),
-        "frechet_mean_mm": float(distances.mean()),
-        "frechet_max_mm": float(distances.max()),
-        "rms_mm": float(np.mean([1e3 * rms_at_equal_times(t, x, d.times, d.positions) for t, x, d in at_times])),
-        **seconds,
-        "end_error_mm": 1e3 * float(np.linalg.norm(rollouts[:, -1] - imitation.goal, axis=1).max()),
+        "demonstrations": len(followed),
+        "frechet_mean_mm": float(np.mean(distances)),
+        "frechet_max_mm": max(distances),
+        "rms_mm": float(np.mean([1e3 * f.rms("learned") for f in followed])),
+        "fit_seconds": fit_seconds,
+        "start_seconds": float(np.median([_seconds_for(imitation, path[0]) for path in source.paths])),
+        "end_error_mm": 1e3 * max(float(np.linalg.norm(path[-1] - imitation.goal)) for path, _ in rollouts),
         "round_trip_of_extent": round_trip / source.extent,
-        "min_det_jacobian": det,
+        "min_det_jacobian": min_det_jacobian(transform.jacobian, grid),
     }
-    arrays = {**seconds, "min_det_jacobian": det, "round_trip_error": round_trip / unit, "goal": imitation.goal / unit}
-    for i, (rollout, moments) in enumerate(zip(rollouts, times, strict=True)):
-        arrays |= {f"rollout_{i}": rollout / unit, f"times_{i}": moments}
-    turned = demonstrations if imitation.has_orientation else ()
-    degrees = [degrees_off(imitation, demonstrations, each)["learned"] for each in turned]
+    arrays = {name: row[name] for name in ("fit_seconds", "start_seconds", "min_det_jacobian")}
+    arrays |= {"round_trip_error": round_trip / unit, "goal": imitation.goal / unit}
+    for i, (path, times) in enumerate(rollouts):
+        arrays |= {f"rollout_{i}": path / unit, f"times_{i}": times}
     choice = "" if imitation.choice is None else f"{imitation.state}. {imitation.choice}"
-    return InSample(row, arrays, rollouts, degrees, choice, imitation.warnings)
+    return InSample(row, arrays, followed, choice, imitation.warnings)
 
 
 def _states(imitation: AnyImitation, paths: Sequence[Array]) -> Array:
@@ -207,15 +199,15 @@ def _arrays(followed: Sequence[Followed], unit: float) -> dict[str, Array]:
     return arrays
 
 
-def turn_row(name: str, degrees: Sequence[Array], followed: Sequence[Followed]) -> dict[str, float | str]:
+def turn_row(name: str, own: Sequence[Followed], held_out: Sequence[Followed]) -> dict[str, float | str]:
     """Row of the table of orientations: median and largest angles over all samples of all demonstrations, degrees."""
-    angles = {"in_sample": degrees}
-    if followed:
-        angles |= {"held_out": [f.degrees["learned"] for f in followed]}
-        angles |= {"mean_of_others": [f.degrees["mean"] for f in followed]}
-    over = {"median": np.median, "largest": np.max}
-    values = {f"{title}_{name}": float(of(off)) for title, off in angles.items() for name, of in over.items()}
-    return {"name": name, **values}
+    angles = {"in_sample": (own, "learned"), "held_out": (held_out, "learned"), "mean_of_others": (held_out, "mean")}
+    row: dict[str, float | str] = {"name": name}
+    for title, (followed, way) in angles.items():
+        if followed:
+            off = [f.degrees[way] for f in followed]
+            row |= {f"{title}_median": float(np.median(off)), f"{title}_largest": float(np.max(off))}
+    return row
 
 
 def summed_up(name: str, folds: int, followed: Sequence[Followed]) -> dict[str, Any]:

@@ -8,8 +8,7 @@ import math
 import os
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass, field
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 from uuid import uuid4
@@ -54,33 +53,28 @@ def engine_of(task: Task) -> Engine:
     return new_engine({task.name: TaskEntry(task.title, lambda: task)})
 
 
-def numbers(
-    accepted: str, minimum: float, maximum: float, *counts: int, kind: type[float] = float
-) -> Callable[[str], tuple[Any, ...]]:
-    """Return a type for argparse: numbers within bounds, with commas between; as many as one of `counts`, or one."""
+def numbers(accepted: str, low: float, high: float, *counts: int, kind: type[float] = float) -> Callable[[str], Any]:
+    """Return a type for argparse: a number within bounds, or a tuple of as many as one of `counts`, between commas."""
 
-    def convert(text: str) -> tuple[float, ...]:
-        try:
-            found = tuple(map(kind, text.split(",")))
-        except ValueError:
-            found = ()
-        if len(found) not in (counts or (1,)) or not all(minimum <= number <= maximum for number in found):
+    def convert(text: str) -> float | tuple[float, ...]:
+        found: list[float] = []
+        with suppress(ValueError):
+            found = [*map(kind, text.split(","))]
+        if len(found) not in (counts or (1,)) or not all(low <= number <= high for number in found):
             raise argparse.ArgumentTypeError(f"found {text.strip()!r}; accepted: {accepted}")
-        return found
+        return tuple(found) if counts else found[0]
 
     return convert
 
 
 def whole_number(minimum: int) -> Callable[[str], int]:
     """Return a type for argparse: a whole number of at least `minimum`."""
-    convert = numbers(f"a whole number, {minimum} or more", minimum, math.inf, kind=int)
-    return lambda text: convert(text)[0]
+    return numbers(f"a whole number, {minimum} or more", minimum, math.inf, kind=int)
 
 
 def positive_number(unit: str, maximum: float) -> Callable[[str], float]:
     """Return a type for argparse: a number above 0 and up to `maximum`."""
-    convert = numbers(f"{unit}, more than 0 and at most {maximum:g}", math.ulp(0), maximum)
-    return lambda text: convert(text)[0]
+    return numbers(f"{unit}, more than 0 and at most {maximum:g}", math.ulp(0), maximum)
 
 
 def interval(minimum: float, maximum: float) -> Callable[[str], tuple[float, float]]:
@@ -148,12 +142,11 @@ T = TypeVar("T")
 _made = threading.local()
 
 
-@dataclass(frozen=True)
 class Made(Generic[T]):
     """A value, such as an engine, that each worker thread makes once, as it is not sent."""
 
-    make: Callable[[], T]
-    key: str = field(default_factory=lambda: uuid4().hex)
+    def __init__(self, make: Callable[[], T]) -> None:
+        self.make, self.key = make, uuid4().hex
 
     def __call__(self) -> T:
         """Return the value of this thread."""
@@ -162,8 +155,10 @@ class Made(Generic[T]):
         return _made.value
 
 
-def add_workers(parser: argparse.ArgumentParser) -> None:
-    """Define `--jobs` and `--dask`."""
+def add_output(parser: argparse.ArgumentParser, suffix: str = "") -> None:
+    """Define `--out`, a file with this suffix or else a folder, and `--jobs` and `--dask`."""
+    metavar, kind = (f"FILE{suffix}", "file") if suffix else ("DIR", "folder")
+    parser.add_argument("--out", type=output(suffix), required=True, metavar=metavar, help=f"{kind} that is written")
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--jobs", type=whole_number(1), default=1, metavar="N", help="processes (default: %(default)s)")
     where.add_argument("--dask", metavar="ADDRESS", help="scheduler of a Dask cluster that computes instead")

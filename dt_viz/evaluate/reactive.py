@@ -20,11 +20,10 @@ from dt_viz.control.controller import ArmController, Phase
 from dt_viz.control.courses import Section
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.evaluate import options as shared
-from dt_viz.evaluate.options import Made, add_workers, computed
 from dt_viz.flows.fields import Array
 from dt_viz.metrics import arc_length, interpolate, resample_by_arc_length
 from dt_viz.motion.stack import LIVE
-from dt_viz.obstacles.shapes import UPRIGHT, Box, Obstacle, Quaternion, Sphere, as_point, as_quaternion
+from dt_viz.obstacles.shapes import ORIGIN, UPRIGHT, Box, Obstacle, Sphere, as_point, as_quaternion
 from dt_viz.scenario.stack import avoiding
 from dt_viz.session.engine import Engine
 
@@ -32,7 +31,7 @@ TICK = 0.01  # s from one tick to the next
 LOOK_PERIOD = 0.03  # s from one look at the obstacles to the next
 HALF_LENGTH = 0.40  # m, half the length of an obstacle's path
 WIGGLE, WAVELENGTH = 0.04, 0.5  # m, amplitude and length of a path's waves
-BOX = (1.0, 0.8, 0.6)  # sides of a box, in diameters
+BOX = np.array([1.0, 0.8, 0.6])  # sides of a box, in diameters
 PEDESTAL_ROOM = 0.10  # m from a path to the base and the first links, which no joint moves out of its way
 TABLE_ROOM = 0.01  # m from the obstacle down to the table
 START_ROOM = 0.05  # m from the undisturbed arm to an obstacle that comes
@@ -49,93 +48,78 @@ class Crossing:
     seconds: float  # that the robot takes without obstacles
     begins: float  # time at which the robot sets out, seconds
     places: Array  # (T, P, 3) centres at each tick until all are gone, metres; NaN for obstacles that are not there
-    wxyz: Sequence[Quaternion]
+    shapes: Sequence[Obstacle]  # the P obstacles, turned as they are on all their way
 
-    def at(self, tick: int) -> Array:
-        """Return the centres (P, 3), metres; NaN for obstacles that are not there."""
-        return self.places[tick] if tick < len(self.places) else np.full_like(self.places[0], np.nan)
+    def at(self, tick: int) -> tuple[Obstacle, ...]:
+        """Return the obstacles that are there at a tick."""
+        if tick >= len(self.places):
+            return ()
+        there = zip(self.shapes, self.places[tick], strict=True)
+        return tuple(_moved(shape, place) for shape, place in there if np.isfinite(place[0]))
+
+
+def _moved(shape: Obstacle, place: Array) -> Obstacle:
+    return shape.moved(as_point(place), shape.wxyz)
 
 
 class Bench:
     """A task's robot."""
 
-    def __init__(self, engine: Engine, task: str, diameter: float, margin: float, boxes: bool = False) -> None:
-        self.diameter, self.margin, self.boxes = diameter, margin, boxes
-        self.follower, self.robot = engine.follower, engine.follower.robot
+    def __init__(self, engine: Engine, task: str, margin: float) -> None:
+        self.margin, self.follower, self.robot = margin, engine.follower, engine.follower.robot
         self.solved = engine.solved(avoiding(engine.task(task), ArmAvoidance((), margin=margin)), LIVE)
         self.goal = self.solved.nominal.goal
         section = Section(self.robot, self.follower.reference(self.solved.nominal))
         self.starts = section.postures(self.solved.nominal.starts[:, None])[:, 0]
 
-    def shape(self, place: Array, wxyz: Quaternion = UPRIGHT) -> Obstacle:
-        """Return the sphere, or box, with its centre at a place (3,), metres."""
-        if self.boxes:
-            a, b, c = (self.diameter * side for side in BOX)
-            return Box(as_point(place), (a, b, c), wxyz)
-        return Sphere(as_point(place), self.diameter)
-
-    def obstacles(self, crossing: Crossing, tick: int) -> tuple[Obstacle, ...]:
-        """Return the obstacles that are there at a tick."""
-        places = zip(crossing.at(tick), crossing.wxyz, strict=True)
-        return tuple(self.shape(place, wxyz) for place, wxyz in places if np.isfinite(place[0]))
-
     def undisturbed(self, start: int) -> tuple[Array, Array]:
-        """Return the hand's places (T, 3), metres, and joints (T, n) at all ticks without an obstacle."""
-        joints = driven(ArmController(self.follower, self.solved), self.starts[start])
-        return self.robot.end_effector(joints), joints
+        """Return the hand's places (T, 3), m, and joints (T, n), rad, at all ticks without an obstacle, to the goal."""
+        controller, q, passed = ArmController(self.follower, self.solved), self.starts[start], []
+        while not passed or (controller.phase is not Phase.RESTING and len(passed) < LONGEST / TICK):
+            passed.append(q)
+            q = q + TICK * controller.step(q, TICK)
+        return self.robot.end_effector(np.array(passed)), np.array(passed)
 
 
-def driven(controller: ArmController, q: Array) -> Array:
-    """Return the joints (T, n), rad, at all ticks of a robot from a posture q (n,) on until it rests at the goal."""
-    passed = []
-    while len(passed) < LONGEST / TICK:
-        passed.append(q)
-        q = q + TICK * controller.step(q, TICK)
-        if controller.phase is Phase.RESTING:
-            break
-    return np.array(passed)
-
-
-def crossings(bench: Bench, speed: float, seed: int, num: int = 1) -> Iterator[Crossing]:
-    """Yield crossings of so many obstacles at once, without an end."""
+def crossings(bench: Bench, shape: Obstacle, speed: float, seed: int, num: int = 1) -> Iterator[Crossing]:
+    """Yield crossings of so many obstacles of a shape at once, at a speed, m/s, without an end."""
     rng, undisturbed = np.random.default_rng(seed), cache(bench.undisturbed)
     for start in cycle(range(len(bench.starts))):
         hand, joints = undisturbed(start)
-        drawn = [_drawn(bench, hand, joints, speed, rng) for _ in range(num)]
-        begins = max(0.0, *(-comes for comes, _, _ in drawn))
-        durations = [arc_length(path)[-1] / speed for _, path, _ in drawn]
-        gone = [begins + comes + duration for (comes, *_), duration in zip(drawn, durations, strict=True)]
-        t = TICK * np.arange(np.ceil(max(gone) / TICK))
-        places = np.full((len(t), num, 3), np.nan)
-        for n, (comes, path, _) in enumerate(drawn):
-            there = (begins + comes <= t) & (t < gone[n])
-            passed = (t[there] - begins - comes) / durations[n]
-            places[there, n] = interpolate(passed, np.linspace(0, 1, len(path)), path)
-        yield Crossing(start, TICK * len(hand), begins, places, [wxyz for *_, wxyz in drawn])
+        drawn = [_drawn(bench, shape, hand, joints, speed, rng) for _ in range(num)]
+        begins = max(0.0, *(-comes for comes, *_ in drawn))
+        t = TICK * np.arange(np.ceil((begins + max(goes for _, goes, *_ in drawn)) / TICK)) - begins
+        places = []
+        for comes, goes, path, _ in drawn:
+            places.append(interpolate(t, np.linspace(comes, goes, len(path)), path))
+            places[-1][(t < comes) | (t >= goes)] = np.nan
+        shapes = [shape for *_, shape in drawn]
+        yield Crossing(start, TICK * len(hand), begins, np.stack(places, axis=1), shapes)
 
 
 def _drawn(
-    bench: Bench, hand: Array, joints: Array, speed: float, rng: np.random.Generator
-) -> tuple[float, Array, Quaternion]:
+    bench: Bench, shape: Obstacle, hand: Array, joints: Array, speed: float, rng: np.random.Generator
+) -> tuple[float, float, Array, Obstacle]:
     """Draw an obstacle that crosses the hand (T, 3), m, and joints (T, n), rad, of an undisturbed motion.
 
-    Returns when it comes, s after the robot sets out, its path (N, 3), metres, and its orientation.
+    Returns when it comes and goes, s after the robot sets out, its path (N, 3), metres, and it where that begins.
     """
     body, wall = bench.follower.whole_arm, bench.robot.pedestal
     pedestal = wall.positions(bench.robot, bench.starts[0])
     while True:
         at = int(rng.uniform(0.25, 0.75) * len(hand))
         path = _path(hand[at] + rng.normal(scale=0.02, size=3), rng)
-        first = bench.shape(path[0], as_quaternion(rng.normal(size=4)) if bench.boxes else UPRIGHT)
-        length = float(arc_length(path)[-1])
+        turn = UPRIGHT if isinstance(shape, Sphere) else as_quaternion(rng.normal(size=4))
+        first = shape.moved(as_point(path[0]), turn)
+        half = float(arc_length(path)[-1]) / 2 / speed  # s
         room = np.linalg.norm(path[:, None] - pedestal, axis=2) - wall.radius - first.radius
-        passing = joints[max(0, at - round(length / 2 / speed / TICK))]
+        passing = joints[max(0, at - round(half / TICK))]
         if (
             path[:, 2].min() >= first.radius + TABLE_ROOM
             and room.min() >= PEDESTAL_ROOM
             and body.clearance(passing[None], first)[0] >= START_ROOM
         ):
-            return at * TICK - length / 2 / speed, path, first.wxyz
+            return at * TICK - half, at * TICK + half, path, first
 
 
 def _path(middle: Array, rng: np.random.Generator) -> Array:
@@ -158,12 +142,12 @@ def simulated(bench: Bench, crossing: Crossing) -> tuple[Array, Array, set[Phase
     for k in range(len(crossing.places) + int((crossing.begins + LONGEST) / TICK)):
         t = k * TICK
         passed.append(q)
-        if k >= len(crossing.places) and went and not present and controller.phase is Phase.RESTING:
+        if k >= len(crossing.places) and not present and controller.phase is Phase.RESTING:
             break
         if not went and t >= crossing.begins:
             controller.go()
             went = True
-        parts = bench.obstacles(crossing, k)
+        parts = crossing.at(k)
         if t >= looks and (parts or present):
             present, looks = bool(parts), t + LOOK_PERIOD
             controller.see(ArmAvoidance(parts, margin=bench.margin))
@@ -177,71 +161,71 @@ def simulated(bench: Bench, crossing: Crossing) -> tuple[Array, Array, set[Phase
 def room_at_coming(bench: Bench, q: Array, crossing: Crossing) -> float:
     """Return the smallest distance of the arm, q (T, n), from an obstacle at the tick at which that comes, metres."""
     ticks = np.isfinite(crossing.places[:, :, 0]).argmax(axis=0)
-    coming = [(q[[k]], bench.shape(crossing.places[k, n], crossing.wxyz[n])) for n, k in enumerate(ticks)]
+    coming = [(q[[k]], _moved(crossing.shapes[n], crossing.places[k, n])) for n, k in enumerate(ticks)]
     return min(float(bench.follower.whole_arm.clearance(*each)[0]) for each in coming)
 
 
 def smallest_distance(bench: Bench, passed: Array, crossing: Crossing) -> float:
     """Return the smallest distance of the arm's meshes from the obstacles, at and at five places between ticks, m."""
     cover, model, best = bench.robot.body, bench.robot.collision, np.inf
-    for wxyz, centres in zip(crossing.wxyz, crossing.places.transpose(1, 0, 2), strict=True):
+    for shape, centres in zip(crossing.shapes, crossing.places.transpose(1, 0, 2), strict=True):
         (there,) = np.nonzero(np.isfinite(centres[:, 0]))
         finely = np.linspace(there[0], there[-1], 6 * (len(there) - 1) + 1)
         q, places = (interpolate(finely, there, values[there]) for values in (passed, centres))
         points = cover.positions(bench.robot, q) - places[:, None]
-        bounds = (bench.shape(np.zeros(3), wxyz).signed_distance(points) - cover.radius).min(axis=1)
+        bounds = (_moved(shape, np.zeros(3)).signed_distance(points) - cover.radius).min(axis=1)
         for k in np.argsort(bounds):  # the spheres cover the meshes
             if bounds[k] >= best:
                 break
-            best = min(best, float(model.obstacle_distance(q[[k]], bench.shape(places[k], wxyz))[0][0]))
+            best = min(best, float(model.obstacle_distance(q[[k]], _moved(shape, places[k]))[0][0]))
     return best
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the command's arguments."""
-    metres = shared.positive_number("metres", 1)
+    metres, speed = shared.positive_number("metres", 1), shared.positive_number("m/s", 2)
     shared.add_task(parser)
-    parser.add_argument(
-        "--speed", type=shared.positive_number("m/s", 2), required=True, metavar="V", help="of obstacles"
-    )
+    parser.add_argument("--speed", type=speed, required=True, metavar="V", help="of obstacles")
     parser.add_argument("--runs", type=shared.whole_number(1), default=20, help="(default: %(default)s)")
     parser.add_argument("--seed", type=shared.whole_number(0), default=0, help="of the paths (default: %(default)s)")
     parser.add_argument("--obstacles", type=shared.whole_number(1), default=1, help="at once (default: %(default)s)")
     parser.add_argument("--boxes", action="store_true", help="boxes of D × 0.8 D × 0.6 D, turned, not spheres")
     parser.add_argument("--diameter", type=metres, default=0.15, metavar="D", help="metres (default: %(default)s)")
     parser.add_argument("--margin", type=metres, default=0.03, metavar="M", help="metres (default: %(default)s)")
-    parser.add_argument("--out", type=shared.output(".npz"), required=True, metavar="FILE.npz", help="what is written")
-    add_workers(parser)
+    shared.add_output(parser, ".npz")
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the command."""
-    task = shared.chosen_task(options)
-    settings = options.diameter, options.margin, options.boxes
-    bench = Made(lambda: Bench(shared.engine_of(task), task.name, *settings))
-    drawn = crossings(bench(), options.speed, options.seed, options.obstacles)
+    task, margin, shape = shared.chosen_task(options), options.margin, Sphere(ORIGIN, options.diameter)
+    if options.boxes:
+        shape = Box.of_extents(as_point(options.diameter * BOX))
+    bench = shared.Made(lambda: Bench(shared.engine_of(task), task.name, margin))
+    drawn = crossings(bench(), shape, options.speed, options.seed, options.obstacles)
     arrays: dict[str, Any] = {"diameter": options.diameter}
     figures: list[dict[str, Any]] = []
     while len(figures) < options.runs:  # obstacles that had no room to come are not counted
         wanted = [*islice(drawn, options.runs - len(figures))]
-        for crossing, found in zip(wanted, computed(options, partial(_measured, bench), wanted), strict=True):
+        for crossing, found in zip(wanted, shared.computed(options, partial(_measured, bench), wanted), strict=True):
             if found is None:
                 continue
             i, (q, phases, of_run) = len(figures), found
-            places = np.array([crossing.at(k) for k in range(len(q))])
-            arrays |= {f"q_{i}": q, f"t_{i}": TICK * np.arange(len(q)), f"wxyz_{i}": crossing.wxyz}
-            arrays[f"obstacle_{i}"] = places[:, 0] if options.obstacles == 1 else places
+            gone = np.full((len(q), *crossing.places.shape[1:]), np.nan)
+            places = np.concatenate([crossing.places, gone])[: len(q)]
+            arrays |= {f"q_{i}": q, f"t_{i}": TICK * np.arange(len(q))}
+            arrays |= {f"wxyz_{i}": [one.wxyz for one in crossing.shapes]}
+            arrays |= {f"obstacle_{i}": places[:, 0] if options.obstacles == 1 else places}
             values = (f"{name} {shared.as_text(value)}" for name, value in of_run.items() if name != "ticks")
             print(i, ", ".join(values), *sorted(phase.value for phase in phases), flush=True)
             figures.append(of_run)
     shared.write_npz(options.out, arrays)
     size = f"{options.obstacles} {'box' if options.boxes else 'sphere'}(s) of {options.diameter:g} m"
-    print(f"\n{task.name}, {size} at {options.speed:g} m/s, margin {options.margin:g} m")
+    print(f"\n{task.name}, {size} at {options.speed:g} m/s, margin {margin:g} m")
     shared.report([summary(figures)])
     return 0
 
 
-def _measured(bench: Made[Bench], crossing: Crossing) -> tuple[Array, set[Phase], dict[str, Any]] | None:
+def _measured(bench: shared.Made[Bench], crossing: Crossing) -> tuple[Array, set[Phase], dict[str, Any]] | None:
     """Run one crossing; None without room for an obstacle to come."""
     q, seconds, phases = simulated(bench(), crossing)
     if room_at_coming(bench(), q, crossing) < COMING_ROOM:

@@ -24,7 +24,6 @@ from dt_viz.errors import FormatError
 from dt_viz.evaluate import options as shared
 from dt_viz.evaluate.around import TURN_ARC, in_ball
 from dt_viz.evaluate.held_out import frechet
-from dt_viz.evaluate.options import Made, add_workers, computed
 from dt_viz.flows.fields import Array
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
@@ -87,32 +86,32 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--count", type=number(1), default=10, help=f"places {default}")
     parser.add_argument("--perturbed", type=number(0), default=200, help=f"starts {default}")
     parser.add_argument("--seed", type=number(0), default=0, help=f"of the places {default}")
-    parser.add_argument("--out", type=shared.output(), required=True, metavar="DIR", help="folder of what is written")
-    add_workers(parser)
+    shared.add_output(parser)
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the command."""
-    methods, folder, draws, fitted = options.methods, options.out, figures.can_draw(), Made(Fitted)
-    for method in map(METHODS.__getitem__, methods):
+    methods, folder, draws = [METHODS[name] for name in options.methods], options.out, figures.can_draw()
+    for method in methods:
         if method.missing:
             found = f"{method.title}, which needs {', '.join(method.missing)}"
             raise FormatError("--methods", found, f"{INSTALL}, or the others")
+    fitted = shared.Made(Fitted)
     problems = {name: fitted().problem(name) for name in options.tasks}
     places = {name: drawn(problems[name], options.count, options.perturbed, options.seed) for name in problems}
-    cases = [(method, name, place) for name in problems for method in methods for place in places[name]]
-    found = computed(options, partial(_measured, fitted), cases)
-    table: dict[str, dict[str, Any]] = {method: {} for method in methods}
+    cases = [(method.name, name, *at) for name in problems for method in methods for at in enumerate(places[name])]
+    found = shared.computed(options, partial(_measured, fitted), cases)
+    table: dict[str, dict[str, Any]] = {method.name: {} for method in methods}
     for name, problem in problems.items():
         title, first_motions, rows = problem.task.title, {}, []
         for method in methods:
             arrays = gathered(problem, [*islice(found, options.count)])
-            shared.write_npz(folder / f"{method}_{name}.npz", arrays)
-            table[method][name] = cells(method, name, arrays)
-            rows.append(_row(METHODS[method].title, title, table[method][name]))
+            shared.write_npz(folder / f"{method.name}_{name}.npz", arrays)
+            table[method.name][name] = cells(method.name, name, arrays)
+            rows.append(_row(method.title, title, table[method.name][name]))
             first_path, obstacle = _whole(arrays["x_0_0"]), Union((places[name][0].sphere,))
-            first_motions[METHODS[method].title] = curves(first_path, problem.task.paths[0], obstacle)
-            print(f"{METHODS[method].title}, {title}: {arrays['seconds'].sum():.0f} s of planning", flush=True)
+            first_motions[method.title] = curves(first_path, problem.task.paths[0], obstacle)
+            print(f"{method.title}, {title}: {arrays['seconds'].sum():.0f} s of planning", flush=True)
         print("\nmean (worst) [paper]; lengths in mm")
         shared.report(rows)
         if draws:
@@ -163,23 +162,19 @@ def _perturbed(problem: Problem, sphere: Sphere, num: int, rng: np.random.Genera
     return np.array(found).reshape(-1, 3)
 
 
-def _measured(fitted: Made[Fitted], case: tuple[str, str, RandomPlace]) -> dict[str, Any]:
+def _measured(fitted: shared.Made[Fitted], case: tuple[str, str, int, RandomPlace]) -> dict[str, Any]:
     """Measure a method, by name, at a place of a task."""
-    method, task, place = case
+    method, task, k, place = case
     problem = fitted().problem(task)
     try:
-        return measured(fitted().planner(method, task), problem, place)
+        return measured(fitted().planner(method, task), problem, k, place)
     except NotFittedError as error:
         found = f"{METHODS[method].title}, {problem.task.title}: {error}"
         raise FormatError("--methods", found, "methods that are fitted to the tasks") from error
 
 
-def measured(planner: Planner, problem: Problem, place: RandomPlace) -> dict[str, Any]:
-    """Plan and measure the motions of a method at a place.
-
-    Returns:
-        The arrays of the file by their names, with {} for the number of the place, and its values of `COLUMNS`.
-    """
+def measured(planner: Planner, problem: Problem, k: int, place: RandomPlace) -> dict[str, Any]:
+    """Plan and measure the motions of a method at the place k; returns its arrays of the file, and its `COLUMNS`."""
     obstacle, ends = Union((place.sphere,)), place.perturbed
     began = time.thread_time()
     plan = planner(obstacle, problem.task.starts)
@@ -194,13 +189,9 @@ def measured(planner: Planner, problem: Problem, place: RandomPlace) -> dict[str
             ends = np.full_like(ends, np.inf)
     near = np.linalg.norm(ends - problem.learned.goal, axis=1) <= REACHED
     columns = [*np.transpose(rows), near.mean() if len(near) else np.nan, seconds]
-    return {
-        **{f"{name}_{{}}_{i}": values[k] for i, values in enumerate(motions) for k, name in enumerate("xtq")},
-        "obstacle_{}": np.array([*place.sphere.position, place.sphere.diameter]),
-        "perturbed_{}": place.perturbed,
-        "ends_{}": ends,
-        **dict(zip(COLUMNS, columns, strict=True)),
-    }
+    arrays = {f"{name}_{k}_{i}": values for i, of in enumerate(motions) for name, values in zip("xtq", of, strict=True)}
+    arrays |= {f"obstacle_{k}": np.array([*place.sphere.position, place.sphere.diameter])}
+    return arrays | {f"perturbed_{k}": place.perturbed, f"ends_{k}": ends} | dict(zip(COLUMNS, columns, strict=True))
 
 
 def measure(problem: Problem, x: Array, t: Array, q: Array, demonstration: Array, obstacle: Union) -> list[float]:
@@ -239,17 +230,16 @@ def gathered(problem: Problem, found: Sequence[Mapping[str, Any]]) -> dict[str, 
     """Gather the arrays of a method's file, of what was measured at each place."""
     arrays: dict[str, Array] = {f"demo_{i}": path for i, path in enumerate(problem.task.paths)}
     arrays |= {f"demo_t_{i}": d.times for i, d in enumerate(problem.task.demonstrations)}
-    for k, at_place in enumerate(found):
-        arrays |= {name.format(k): values for name, values in at_place.items() if name not in COLUMNS}
+    for at_place in found:
+        arrays |= at_place
     columns = {name: np.array([at_place[name] for at_place in found]) for name in COLUMNS}
     return arrays | columns | {"goal": problem.learned.goal}
 
 
 def cells(method: str, task: str, arrays: Mapping[str, Array]) -> dict[str, dict[str, float | None]]:
     """Return the cells of a method's file, by column; None is unknown."""
-    paper: dict[str, float | None] = {}
-    if method in PAPER:
-        paper = dict(zip(("frechet", "arm_depth"), PAPER[method][PAPER_TASKS.index(task)], strict=True))
+    of_paper = PAPER[method][PAPER_TASKS.index(task)] if method in PAPER else (None, None)
+    paper: Mapping[str, float | None] = dict(zip(("frechet", "arm_depth"), of_paper, strict=True))
     found = {}
     for column in COLUMNS:
         of_ours = {"mean": np.mean, "worst": np.min if column in SMALLEST else np.max}

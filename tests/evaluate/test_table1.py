@@ -111,7 +111,7 @@ def test_motions_that_end_beside_the_goal_have_not_reached_it(problem):
         return Plan(paths, tuple(np.array([0.0, 1.0]) for _ in paths), tuple(np.zeros((2, 6)) for _ in paths))
 
     place = table1.RandomPlace(Sphere((5.0, 0.0, 0.0), 0.15), starts)
-    arrays = table1.gathered(problem, [table1.measured(plan, problem, place)])
+    arrays = table1.gathered(problem, [table1.measured(plan, problem, 0, place)])
     np.testing.assert_allclose(arrays["ends_0"], ends)
     assert arrays["reached"] == pytest.approx([2 / 3])
 
