@@ -15,7 +15,7 @@ import torch  # pyright: ignore[reportMissingImports] - only this needs it
 from scipy.signal import savgol_filter
 
 from dt_viz.baselines.base import NotFittedError, Problem
-from dt_viz.baselines.eflow import ARCHITECTURE, num_of
+from dt_viz.baselines.eflow import MASKS, SLOPE, num_of
 from dt_viz.flows.fields import Array
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.preparation import ImitationError, prepare
@@ -24,8 +24,14 @@ from dt_viz.metrics import interpolate
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """What is learned from, and how quickly."""
+    """Size of the networks, the authors', what is learned from, and how quickly."""
 
+    num_features: int = 200
+    """Number of random Fourier features of each of a coupling layer's two functions."""
+    length_scale: float = 0.45
+    """Length scale of the features, in the unit of the normalised demonstrations: their extent along each axis is 1."""
+    num_hidden: int = 100
+    """Width of the two hidden layers of the speed."""
     rate: float = 1e-4
     """Learning rate of Adam."""
     decay: float = 1e-10
@@ -104,14 +110,14 @@ def samples(demonstrations: tuple[Demonstration, ...]) -> tuple[Array, Array, Ar
 
 def initial(dim: int, rng: np.random.Generator) -> tuple[Tensors, Tensors]:
     """Fixed features, and what is learned: coupling layers that are the identity, a random speed."""
-    features, num_moved = (ARCHITECTURE.num_blocks, 2, ARCHITECTURE.num_features), (dim + 1) // 2
+    features, num_moved = (len(MASKS), 2, SETTINGS.num_features), (dim + 1) // 2
     tensor = lambda array: torch.tensor(array, dtype=torch.float32)  # noqa: E731
     fixed = {
-        "frequencies": tensor(rng.normal(size=(*features, num_moved)) / ARCHITECTURE.length_scale),
+        "frequencies": tensor(rng.normal(size=(*features, num_moved)) / SETTINGS.length_scale),
         "phases": tensor(rng.uniform(0, 2 * np.pi, size=features)),
     }
     learned = {"weights": torch.zeros(*features, num_moved)}
-    for k, (num_in, num_out) in enumerate(pairwise((dim, *2 * (ARCHITECTURE.num_hidden,), 1))):
+    for k, (num_in, num_out) in enumerate(pairwise((dim, *2 * (SETTINGS.num_hidden,), 1))):
         bound = num_in**-0.5
         learned[f"speed_{k}"] = tensor(rng.uniform(-bound, bound, size=(num_out, num_in + 1)))
     return fixed, {name: value.requires_grad_() for name, value in learned.items()}
@@ -123,7 +129,7 @@ def velocity(x: torch.Tensor, goal: torch.Tensor, fixed: Tensors, learned: Tenso
     J⁻¹ is applied layer by layer, from the last to the first: that of a coupling layer is triangular.
     """
     dim, z, passed = x.shape[1], torch.cat([x, goal[None]]), []
-    for k, (a, b) in enumerate(ARCHITECTURE.masks):
+    for k, (a, b) in enumerate(MASKS):
         num_a, num_b = num_of(a, dim), num_of(b, dim)
         W, w = fixed["frequencies"][k, ..., :num_a], learned["weights"][k, ..., :num_b]
         phase = torch.addmm(fixed["phases"][k].flatten(), z[:, a], W.flatten(0, 1).T)
@@ -140,7 +146,7 @@ def velocity(x: torch.Tensor, goal: torch.Tensor, fixed: Tensors, learned: Tenso
     for k in range(3):
         layer = learned[f"speed_{k}"]
         x = x @ layer[:, :-1].T + layer[:, -1]
-        x = torch.nn.functional.leaky_relu(x, ARCHITECTURE.slope) if k < 2 else x
+        x = torch.nn.functional.leaky_relu(x, SLOPE) if k < 2 else x
     return x.exp() * U
 
 

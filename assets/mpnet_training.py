@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from dt_viz.baselines.base import NotFittedError, Problem
-from dt_viz.baselines.mpnet import ARCHITECTURE, Network
+from dt_viz.baselines.mpnet import Network
 from dt_viz.flows.fields import Array
 from dt_viz.metrics import resample_by_arc_length
 
@@ -18,6 +18,8 @@ from dt_viz.metrics import resample_by_arc_length
 class TrainingSettings:
     """What is learned from, and how quickly."""
 
+    hidden: tuple[int, ...] = (112, 96, 64, 32)
+    """Widths of the hidden layers; the authors' network has eleven, up to 1280 wide."""
     num_waypoints: int = 40
     """Number of postures of a demonstration, evenly along it in joint space: half of a search's steps."""
     batch: int = 64
@@ -41,7 +43,7 @@ def train(problem: Problem, num_epochs: int, report: Callable[[str], None], seed
     """
     x, y, centre, scale = steps(problem)
     rng = np.random.default_rng(seed)
-    arrays, unit = initial(ARCHITECTURE.widths(problem.robot.num_joints), rng), {"centre": centre, "scale": scale}
+    arrays, unit = initial(problem.robot.num_joints, rng), {"centre": centre, "scale": scale}
     mean, spread = ({name: np.zeros_like(array) for name, array in arrays.items()} for _ in range(2))
     num_steps = 0
     for epoch in range(num_epochs):
@@ -84,10 +86,10 @@ def steps(problem: Problem) -> tuple[Array, Array, Array, Array]:
     return np.concatenate(x), np.concatenate(y), centre, scale
 
 
-def initial(widths: tuple[int, ...], rng: np.random.Generator) -> dict[str, Array]:
-    """Random arrays of a network, uniform within 1/√inputs."""
-    arrays: dict[str, Array] = {"slopes": np.full(len(widths) - 2, 0.25)}
-    for k, (num_in, num_out) in enumerate(pairwise(widths)):
+def initial(num_joints: int, rng: np.random.Generator) -> dict[str, Array]:
+    """Random arrays of a network from (q, q_goal) to the next posture, uniform within 1/√inputs."""
+    arrays: dict[str, Array] = {"slopes": np.full(len(SETTINGS.hidden), 0.25)}
+    for k, (num_in, num_out) in enumerate(pairwise((2 * num_joints, *SETTINGS.hidden, num_joints))):
         for name, shape in ((f"W_{k}", (num_out, num_in)), (f"c_{k}", (num_out,))):
             arrays[name] = rng.uniform(-(num_in**-0.5), num_in**-0.5, shape)
     return arrays

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from dt_viz.baselines.eflow import ARCHITECTURE
+from dt_viz.baselines.eflow import MASKS
 
 
 def joints_of(plan):
@@ -15,8 +15,7 @@ def eflow_weights(task, seed=0, amplitude=0.01):
     """Some weights, as training leaves them; the goal is that of the task."""
     rng = np.random.default_rng(seed)
     dim, goal = task.demonstrations[0].dimension, task.demonstrations[0].positions[-1]
-    features, moved = (ARCHITECTURE.num_blocks, 2, ARCHITECTURE.num_features), (dim + 1) // 2
-    num_hidden = ARCHITECTURE.num_hidden
+    features, moved, num_hidden = (len(MASKS), 2, 200), (dim + 1) // 2, 100
     points = np.concatenate([d.positions for d in task.demonstrations])
     scale = 1 / np.ptp(points, axis=0)
     return {

@@ -7,15 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 from importlib.util import find_spec
-from io import BytesIO
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
 from dt_viz.errors import Cancelled, DataError, FormatError, never, parsing
+from dt_viz.files.npz import arrays_of
 from dt_viz.flows.fields import Array
 from dt_viz.learning.store import fingerprint
 from dt_viz.motion.nominal import Learned
@@ -24,8 +23,12 @@ from dt_viz.robot.robot import Robot
 from dt_viz.scenario.tasks import TASKS, Task
 from dt_viz.shipped import ASSETS
 
-INSTALL = 'pip install "dt-viz[baselines]"'
-"""Command that installs what some methods need beside DT-Viz itself."""
+INSTALL = 'pip install "dt-viz[baselines]"'  # command that installs what some methods need beside DT-Viz itself
+FOLDER = ASSETS / "baselines"  # folder of the weights that ship with DT-Viz
+MADE_BY = "python -m assets.train_baselines"  # command that makes the weights, in a checkout
+ONLY_SHIPPED = "only for the shipped tasks"
+"""Reason why a method without weights for a task, such as one of the user's own, cannot be chosen."""
+MAX_BYTES = 10**8  # largest number of bytes that a file of weights unpacks to
 
 
 class NotFittedError(Exception):
@@ -93,20 +96,14 @@ class Method:
     """Name of the weights that it loads, which are made in advance for each task; empty if it has none."""
     needs: tuple[str, ...] = ()  # modules beyond DT-Viz's own that it cannot plan without
 
+    def is_offered(self, task: str) -> bool:
+        """Return whether it can be shown for the task of a name: whether its weights, if any, are made for that."""
+        return not self.weights or weights_file(FOLDER, self.weights, task).is_file()
+
     @property
     def missing(self) -> tuple[str, ...]:
         """Modules it needs that are not installed; see `INSTALL`."""
         return tuple(module for module in self.needs if find_spec(module) is None)
-
-
-FOLDER = ASSETS / "baselines"  # folder of the weights that ship with DT-Viz
-MADE_BY = "python -m assets.train_baselines"  # command that makes the weights, in a checkout
-ONLY_SHIPPED = "only for the shipped tasks"
-"""Reason why a method without weights for a task, such as one of the user's own, cannot be chosen."""
-
-
-class WeightsError(DataError):
-    """A file of weights that cannot be read."""
 
 
 def load_weights(method: str, version: int, task: Task, folder: Path = FOLDER) -> dict[str, Array]:
@@ -116,14 +113,12 @@ def load_weights(method: str, version: int, task: Task, folder: Path = FOLDER) -
         NotFittedError: there are none, the file is damaged, or it is of another method, version or task.
     """
     path = weights_file(folder, method, task.name)
-    accepted = f"weights as {MADE_BY!r} writes them"
     if not path.is_file():
         remedy = f"{MADE_BY} --method {method} --task {task.name}" if task.name in TASKS else ONLY_SHIPPED
         raise NotFittedError(f"{method} has not been trained for {task.title!r}; {remedy}")
     try:
-        with parsing(WeightsError, path, "file", accepted):
-            with np.load(BytesIO(path.read_bytes()), allow_pickle=False) as archive:
-                arrays = dict(archive)
+        with parsing(DataError, path, "file", f"weights as {MADE_BY!r} writes them"):
+            arrays = arrays_of(path, max_bytes=MAX_BYTES)
             for field, wanted in stamp(method, version, task).items():
                 found = arrays.pop(field).item()
                 if found != wanted:
@@ -131,7 +126,7 @@ def load_weights(method: str, version: int, task: Task, folder: Path = FOLDER) -
             for name, array in arrays.items():
                 if array.dtype.kind not in "fiub" or not np.isfinite(array).all():
                     raise FormatError(f"array {name!r}", "text, or numbers that are not finite", "finite numbers")
-    except WeightsError as error:
+    except DataError as error:
         raise NotFittedError(str(error)) from error
     return {name: array.astype(float) if array.dtype.kind == "f" else array for name, array in arrays.items()}
 
@@ -139,12 +134,6 @@ def load_weights(method: str, version: int, task: Task, folder: Path = FOLDER) -
 def weights_file(folder: Path, method: str, task: str) -> Path:
     """The file of a method's weights for the task of a name."""
     return folder / f"{method}_{task}.npz"
-
-
-@cache
-def is_trained(method: str, task: str) -> bool:
-    """Return whether a method has weights for the task of a name, as found once."""
-    return weights_file(FOLDER, method, task).is_file()
 
 
 def stamp(method: str, version: int, task: Task) -> dict[str, str | int]:

@@ -6,9 +6,8 @@ rollout is one pass of ψ⁻¹ along a ray, and its times are the integral of 1/
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,27 +24,10 @@ from dt_viz.obstacles.union import Union
 from dt_viz.scenario.tasks import Task
 
 VERSION = 1  # version of the weights, raised with every change to what they mean
-
-
-@dataclass(frozen=True)
-class EFlowSettings:
-    """Architecture of the networks, the authors'."""
-
-    num_blocks: int = 10  # number of coupling layers
-    num_features: int = 200  # number of random Fourier features of each of a layer's two functions
-    length_scale: float = 0.45
-    """Length scale of the features, in the unit of the normalised demonstrations: their extent along each axis is 1."""
-    num_hidden: int = 100  # width of the two hidden layers of the speed
-    slope: float = 0.01  # slope of their leaky rectifiers below zero
-
-    @property
-    def masks(self) -> tuple[tuple[slice, slice], ...]:
-        """Coordinates that each layer reads, and those that it moves: of odd and of even number in turn."""
-        even, odd = slice(0, None, 2), slice(1, None, 2)
-        return tuple((odd, even) if k % 2 == 0 else (even, odd) for k in range(self.num_blocks))
-
-
-ARCHITECTURE = EFlowSettings()
+SLOPE = 0.01  # slope below zero of the leaky rectifiers between the layers of the speed
+ODD, EVEN = slice(1, None, 2), slice(0, None, 2)
+MASKS = ((ODD, EVEN), (EVEN, ODD)) * 5
+"""Coordinates that each of the authors' ten coupling layers reads, and those that it moves."""
 
 
 def num_of(coordinates: slice, dim: int) -> int:
@@ -129,24 +111,12 @@ class Normalisation(Diffeomorphism):
         return image, None if U is None else U * scale[:, None]
 
 
-def _speed(layers: Sequence[tuple[Array, Array]], x: Array) -> Array:
-    """σ (N,) = exp of a network of weights (out, in) and biases (out,), in units a second, at points `x` (N, k)."""
-    for W, c in layers[:-1]:
-        x = x @ W.T + c
-        x = np.maximum(x, ARCHITECTURE.slope * x)
-    W, c = layers[-1]
-    return np.exp(x @ W.T + c)[:, 0]
-
-
 @dataclass(frozen=True, eq=False)
 class EFlowSystem:
     """A learned EFlow in the world; stable by construction: ‖ψ(y) − ψ(y_e)‖ falls at the rate σ along every motion."""
 
     transform: Diffeomorphism  # ψ from the world to the latent space, in the world's frame
-    normalised: Callable[[Array], Array]
-    """Takes world points (N, 3) to the normalised coordinates of the demonstrations (N, k)."""
-    speed: Callable[[Array], Array]  # σ (N,), normalised units a second, at normalised points (N, k)
-    scale: float  # world metres for one latent unit
+    speed: Callable[[Array], Array]  # σ (N,), m/s, at points (N, 3), metres
     goal: Array  # y_e (3,), metres
     latent_goal: Array  # ψ(y_e) (3,)
 
@@ -160,24 +130,30 @@ class EFlowSystem:
         couplings = [
             Coupling.of(a, b, W[..., : num_of(a, dim)], phases, w[..., : num_of(b, dim)])
             for (a, b), W, phases, w in zip(
-                ARCHITECTURE.masks,
+                MASKS,
                 *(arrays[name].astype(precision) for name in ("frequencies", "phases", "weights")),
                 strict=True,
             )
         ]
         normalisation = Normalisation(*arrays["normalisation"])
         transform = Placed(Chain([*couplings[::-1], normalisation]), task.origin, task.axes, task.scale)
-        layers = [(arrays[f"speed_{k}"][:, :-1], arrays[f"speed_{k}"][:, -1]) for k in range(3)]
+
+        def speed(y: Array) -> Array:
+            x = normalisation.forward(transform.to_frame(y)[:, :dim])
+            for k in range(3):
+                layer = arrays[f"speed_{k}"]  # weights and biases (out, in + 1)
+                x = x @ layer[:, :-1].T + layer[:, -1]
+                x = np.maximum(x, SLOPE * x) if k < 2 else x
+            return task.scale * np.exp(x)[:, 0]
+
         goal = task.to_world(arrays["goal"])
-        normalised = lambda y: normalisation.forward(transform.to_frame(y)[:, :dim])  # noqa: E731
-        return cls(transform, normalised, partial(_speed, layers), task.scale, goal, transform.forward(goal))
+        return cls(transform, speed, goal, transform.forward(goal))
 
     def velocity(self, y: Array) -> Array:
         """ẏ (N, 3), m/s, at `y` (N, 3), metres."""
         z, J = self.transform.jacobian(y)
         descent = unit(self.latent_goal - z)
-        rate = self.scale * self.speed(self.normalised(y))
-        return rate[:, None] * np.linalg.solve(J, descent[..., None])[..., 0]
+        return self.speed(y)[:, None] * np.linalg.solve(J, descent[..., None])[..., 0]
 
     def rollouts(self, starts: Array, spacing: float) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
         """Motions from starts (R, 3), metres: paths (T, 3), sampled no farther than `spacing` apart, and times (T,), s.
@@ -190,8 +166,7 @@ class EFlowSystem:
             return self.transform.inverse(self.latent_goal + (1 - fraction)[:, None] * rays[index])[:, None]
 
         bundle = refined(evenly_sampled(evaluate, len(starts), 50), evaluate, spacing)
-        slowness = bundle.split(1 / self.speed(self.normalised(bundle.positions)))
-        lengths = np.linalg.norm(rays, axis=1) / self.scale
+        slowness, lengths = bundle.split(1 / self.speed(bundle.positions)), np.linalg.norm(rays, axis=1)
         steps = (
             length * np.diff(fraction) * (slow[1:] + slow[:-1]) / 2
             for length, fraction, slow in zip(lengths, bundle.split(bundle.fraction), slowness, strict=True)

@@ -28,15 +28,12 @@ from dt_viz.obstacles.union import Union
 
 LEAST_SLANT = 0.1
 """Least n·r: beyond it the surface is not star-shaped about the reference point, and the modulation not defined."""
-
-
 TOLERANCE = 1e-3
 """Tolerated error of a step (Runge–Kutta of order 3, Bogacki and Shampine), metres."""
 LONGEST_STEP = 0.06  # largest length of a step, metres: obstacles are not stepped over
 NEAR_GOAL = 2e-3  # distance from the goal at which a motion counts as arriving, metres
 APPROACH = 0.06  # distance from the goal from which on steps are shorter in proportion, metres
-SLOWEST = 0.01
-"""Part of the imitation's speed at which a motion is about to get stuck before an obstacle."""
+SLOWEST = 0.01  # part of the imitation's speed at which a motion is about to get stuck before an obstacle
 LONGEST = 4.0  # largest length of a path, metres
 
 

@@ -38,27 +38,11 @@ from dt_viz.robot.robot import Robot
 TRAINED_FOR = "jaco"  # name of the arm whose postures the weights are for
 _one_at_a_time = threading.Lock()  # OMPL's random numbers have one seed for the whole process
 VERSION = 2  # version of the weights, raised with every change to what they mean
-
-
-@dataclass(frozen=True)
-class MPNetSettings:
-    """Architecture of the planning network, and bounds of the search."""
-
-    hidden: tuple[int, ...] = (112, 96, 64, 32)
-    """Widths of the hidden layers; the authors' network has eleven, up to 1280 wide."""
-    num_certain: int = 2  # number of its last layers that no dropout comes before
-    dropout: float = 0.5  # probability that a neuron is left out, in training and in planning
-    max_steps: int = 80
-    """Largest number of postures planned for one stretch, from both ends together."""
-    max_rounds: int = 3  # largest number of times that colliding stretches are planned again
-    seed: int = 0  # seed of the dropout of each motion
-
-    def widths(self, num_joints: int) -> tuple[int, ...]:
-        """Widths of all layers, from (q, q_goal) to the next posture."""
-        return 2 * num_joints, *self.hidden, num_joints
-
-
-ARCHITECTURE = MPNetSettings()
+NUM_CERTAIN = 2  # number of the network's last layers that no dropout comes before
+DROPOUT = 0.5  # probability that a neuron is left out, in training and in planning
+MAX_STEPS = 80  # largest number of postures planned for one stretch, from both ends together
+MAX_ROUNDS = 3  # largest number of times that colliding stretches are planned again
+SEED = 0  # seed of the dropout of each motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,8 +63,8 @@ class Network:
 
     def masks(self, rng: np.random.Generator, num: int) -> list[Array]:
         """Factors (num, out) for the outputs of the first layers: 0 for neurons that are left out, else 1/(1 − p)."""
-        kept = 1 - ARCHITECTURE.dropout
-        return [(rng.random((num, len(c))) < kept) / kept for c in self.biases[: -ARCHITECTURE.num_certain]]
+        kept = 1 - DROPOUT
+        return [(rng.random((num, len(c))) < kept) / kept for c in self.biases[:-NUM_CERTAIN]]
 
     def traced(self, x: Array, masks: Sequence[Array]) -> tuple[list[Array], list[Array]]:
         """Compute each layer's inputs (N, in) and sums (N, out) for `x` (N, in); the last sums are the output."""
@@ -124,9 +108,9 @@ class Search:
         return self.known[line]
 
     def bidirectional(self, start: Array, goal: Array) -> list[Array]:
-        """Plan from both ends in turn until they can be joined; after `max_steps` they are joined all the same."""
+        """Plan from both ends in turn until they can be joined; after `MAX_STEPS` they are joined all the same."""
         own, other = [start], [goal]
-        for _ in range(ARCHITECTURE.max_steps):
+        for _ in range(MAX_STEPS):
             robot = self.surroundings.robot
             own.append(robot.clip(self.model.next(own[-1], other[-1], self.rng)))
             joined = self.free(own[-1], other[-1])
@@ -161,7 +145,7 @@ class Search:
     def way(self, query: Query, replan: Replan | None) -> list[Array]:
         """Plan a motion, in the end by `replan` where that is given; it may collide."""
         way = self.contracted(self.bidirectional(query.start, query.goal))
-        for again in (*[Search.bidirectional] * ARCHITECTURE.max_rounds, *([replan] if replan else [])):
+        for again in (*[Search.bidirectional] * MAX_ROUNDS, *([replan] if replan else [])):
             if self.is_free(way):
                 break
             way = self.contracted(self.replanned(way, again))
@@ -182,7 +166,7 @@ def fit(problem: Problem, replan: Replan | None = None, folder: Path = FOLDER) -
         surroundings = PlanningScene(problem.robot, obstacle)
         queries, ways, colliding = [Query.of(problem, start) for start in starts], [], 0
         for query in queries:
-            search = Search(model, surroundings, np.random.default_rng(ARCHITECTURE.seed), cancelled)
+            search = Search(model, surroundings, np.random.default_rng(SEED), cancelled)
             way = search.way(query, replan)
             colliding += not search.is_free(way)
             ways.append(np.stack(way))
@@ -242,7 +226,7 @@ def _planned(
         return np.array([state[joint] for joint in range(robot.num_joints)])
 
     util.setLogLevel(util.LOG_NONE)
-    util.RNG.setSeed(ARCHITECTURE.seed + 1)  # 0 would be random
+    util.RNG.setSeed(SEED + 1)  # 0 would be random
     space, bounds = base.RealVectorStateSpace(robot.num_joints), base.RealVectorBounds(robot.num_joints)
     for joint, ends in enumerate(zip(robot.lower, robot.upper, start, goal, strict=True)):
         low, high, *both = map(float, ends)

@@ -35,8 +35,14 @@ _ALL = (
     Method("linear", "Linear", _IS_STRAIGHT, fit_straight, live=True, avoids=False),
     Method("modulation", "Modulation", _IS_LED_PAST, modulation.fit, live=True),
 )
-METHODS: Mapping[str, Method] = {method.name: method for method in _ALL}
+METHODS: dict[str, Method] = {method.name: method for method in _ALL}
 """Every method, in the order of the tables."""
+OURS = METHODS["ours"]
+
+
+def others() -> list[Method]:
+    """Return the methods that a page can show beside ours, in the order of the tables."""
+    return [method for method in METHODS.values() if method is not OURS]
 
 
 def problem_of(learned: Learned, follower: Follower) -> Problem:

@@ -11,7 +11,7 @@ places for each of push box, lift box and draw S.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -42,63 +42,59 @@ def repulsion(obstacle: Union, y: Array) -> tuple[Array, Array]:
     return distance, speed[:, None] * normal
 
 
-@dataclass(frozen=True, eq=False)
-class RepulsivePlanner:
-    """EFlow pushed away from obstacles; see `Planner`."""
-
-    system: EFlowSystem
-
-    def __call__(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
-        """Plan motions of the end effector; see `Planner`."""
-        motions: dict[int, tuple[Array, Array]] = {}
-
-        def go_on(row: int, path: Array, times: Array) -> None:
-            if row in motions:
-                before, passed = motions[row]
-                path, times = np.concatenate([before, path[1:]]), np.append(passed, passed[-1] + times[1:])
-            motions[row] = path, times
-
-        rows, y = [*range(len(starts))], starts
-        for _ in range(MAX_VISITS):
-            entering = []
-            for row, path, times in zip(rows, *self.system.rollouts(y, LIVE.spacing), strict=True):
-                inside = obstacle.signed_distance(path) < RANGE
-                last = max(int(inside.argmax()) - 1, 0) if inside.any() else len(path) - 1
-                go_on(row, path[: last + 1], times[: last + 1])
-                entering += [row] if inside.any() else []
-            if not entering:
-                break
-            walks, leave = self._stepped(obstacle, np.stack([motions[row][0][-1] for row in entering]), cancelled)
-            for row, walk in zip(entering, walks, strict=True):
-                go_on(row, walk, np.arange(len(walk)) / RATE)
-            rows = [row for row, leaves in zip(entering, leave, strict=True) if leaves]
-            if not rows:
-                break
-            y = np.stack([motions[row][0][-1] for row in rows])
-        paths, times = zip(*(motions[row] for row in range(len(starts))), strict=True)
-        return Plan(paths, times)
-
-    def _stepped(self, obstacle: Union, y: Array, cancelled: Cancelled) -> tuple[list[Array], Mask]:
-        """Step motions from `y` (N, 3) while they are within the range: paths (N_i, 3), and which leave it (N,)."""
-        interval, window = 1 / RATE, round(STUCK_TIME * RATE)
-        places, lengths = [y], np.ones(len(y), dtype=int)
-        leave, within = np.zeros(len(y), dtype=bool), np.ones(len(y), dtype=bool)
-        before, force = repulsion(obstacle, y)
-        while within.any() and len(places) < LONGEST * RATE:
-            end_if(cancelled)
-            y = y.copy()
-            y[within] += interval * (self.system.velocity(y[within]) + force[within])
-            places.append(y)
-            lengths[within] += 1
-            distance, force = repulsion(obstacle, y)
-            leave |= within & (distance >= RANGE) & (distance >= before)
-            within &= ~leave
-            if len(places) > window:
-                within &= np.linalg.norm(y - places[-1 - window], axis=1) >= STUCK_DISTANCE
-            before = distance
-        return [path[:length] for path, length in zip(np.stack(places, axis=1), lengths, strict=True)], leave
-
-
 def fit(problem: Problem) -> Planner:
     """Load EFlow's weights for the task. Raises NotFittedError where there are none that can be used."""
-    return RepulsivePlanner(load_system(problem.task))
+    return partial(plan, load_system(problem.task))
+
+
+def plan(system: EFlowSystem, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
+    """Plan motions of the end effector; see `Planner`."""
+    motions: dict[int, tuple[Array, Array]] = {}
+
+    def go_on(row: int, path: Array, times: Array) -> None:
+        if row in motions:
+            before, passed = motions[row]
+            path, times = np.concatenate([before, path[1:]]), np.append(passed, passed[-1] + times[1:])
+        motions[row] = path, times
+
+    rows, y = [*range(len(starts))], starts
+    for _ in range(MAX_VISITS):
+        entering = []
+        for row, path, times in zip(rows, *system.rollouts(y, LIVE.spacing), strict=True):
+            inside = obstacle.signed_distance(path) < RANGE
+            last = max(int(inside.argmax()) - 1, 0) if inside.any() else len(path) - 1
+            go_on(row, path[: last + 1], times[: last + 1])
+            entering += [row] if inside.any() else []
+        if not entering:
+            break
+        begin = np.stack([motions[row][0][-1] for row in entering])
+        walks, leave = _stepped(system, obstacle, begin, cancelled)
+        for row, walk in zip(entering, walks, strict=True):
+            go_on(row, walk, np.arange(len(walk)) / RATE)
+        rows = [row for row, leaves in zip(entering, leave, strict=True) if leaves]
+        if not rows:
+            break
+        y = np.stack([motions[row][0][-1] for row in rows])
+    paths, times = zip(*(motions[row] for row in range(len(starts))), strict=True)
+    return Plan(paths, times)
+
+
+def _stepped(system: EFlowSystem, obstacle: Union, y: Array, cancelled: Cancelled) -> tuple[list[Array], Mask]:
+    """Step motions from `y` (N, 3) while they are within the range: paths (N_i, 3), and which leave it (N,)."""
+    interval, window = 1 / RATE, round(STUCK_TIME * RATE)
+    places, lengths = [y], np.ones(len(y), dtype=int)
+    leave, within = np.zeros(len(y), dtype=bool), np.ones(len(y), dtype=bool)
+    before, force = repulsion(obstacle, y)
+    while within.any() and len(places) < LONGEST * RATE:
+        end_if(cancelled)
+        y = y.copy()
+        y[within] += interval * (system.velocity(y[within]) + force[within])
+        places.append(y)
+        lengths[within] += 1
+        distance, force = repulsion(obstacle, y)
+        leave |= within & (distance >= RANGE) & (distance >= before)
+        within &= ~leave
+        if len(places) > window:
+            within &= np.linalg.norm(y - places[-1 - window], axis=1) >= STUCK_DISTANCE
+        before = distance
+    return [path[:length] for path, length in zip(np.stack(places, axis=1), lengths, strict=True)], leave

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dt_viz.baselines.base import INSTALL, Method, NotFittedError, Planner, Problem, is_trained
-from dt_viz.baselines.registry import METHODS, problem_of
+from dt_viz.baselines.base import INSTALL, Method, NotFittedError, Planner, Problem
+from dt_viz.baselines.registry import OURS, others, problem_of
 from dt_viz.errors import Cancelled, end_if, never
 from dt_viz.flows.fields import Array
 from dt_viz.memo import Memo, kept
@@ -24,20 +24,21 @@ from dt_viz.scenario.tasks import Task
 from dt_viz.session.drawing import arm_along
 from dt_viz.session.frame import Compared, Frame, Scores
 
-OURS = METHODS["ours"]
-OTHERS = tuple(method for method in METHODS.values() if method is not OURS)
-"""Methods that a page can show beside ours."""
 NEWEST = 32  # number of plans that are kept
 TOLERANCE = 1e-4  # by how much a maximum collision distance may be too small, metres
 WAITS, NEXT, NO_WAY = "waits for the obstacle to rest", "waits for its turn", "finds no way"
 
 
+def chosen(view: View, task: str) -> list[Method]:
+    """Return the methods that a view shows beside ours for the task of a name."""
+    return [method for method in others() if method.name in view.compared and method.is_offered(task)]
+
+
 @dataclass(eq=False)
-class _Record:
+class _Result:
     """What is known of a method around an obstacle; it grows while the obstacle rests."""
 
     known: Compared | None = None  # without curves and arm; None until its motions are planned
-    is_complete: bool = False  # whether nothing is left to work out
 
 
 def _around(method: Method, learned: Learned, frame: Frame) -> tuple[Hashable, ...]:
@@ -47,89 +48,67 @@ def _around(method: Method, learned: Learned, frame: Frame) -> tuple[Hashable, .
     return method.name, learned, frame.scenario.obstacle
 
 
-def is_offered(method: Method, task: str) -> bool:
-    """Return whether a method can be shown for the task of a name: whether its weights, if any, are made for that."""
-    return not method.weights or is_trained(method.weights, task)
-
-
-def chosen(view: View, task: str) -> list[Method]:
-    """Return the methods that a view shows beside ours for the task of a name."""
-    return [method for method in OTHERS if method.name in view.compared and is_offered(method, task)]
-
-
 class Comparison:
-    """Motions of other methods, for one engine and on its thread; what an edit leaves unchanged is kept."""
+    """Motions of the compared methods, for one engine and on its thread; what an edit leaves unchanged is kept."""
 
     def __init__(self, follower: Follower, memo: Memo) -> None:
         self._follower, self.memo = follower, memo
 
-    def of(self, frame: Frame, learned: Learned, notes: Mapping[str, str] | None = None) -> tuple[Compared, ...]:
-        """The methods that the view of a frame shows, ours first; those that do not follow a drag as far as known.
+    def of(self, frame: Frame, learned: Learned, cancelled: Cancelled = never) -> Iterator[tuple[Compared, ...]]:
+        """The methods that the view of a frame shows, ours first, again each time that more is known of them.
 
-        Our task is `learned`; `notes`, by the methods' names, say what is waited for.
-        """
-        return tuple(
-            self._compared(method, frame, learned, (notes or {}).get(method.name, WAITS)) for method in _chosen(frame)
-        )
-
-    def complete(self, frame: Frame, learned: Learned, cancelled: Cancelled) -> Iterator[Mapping[str, str]]:
-        """Work out what is left for a scenario that rests; stops whenever `of` would tell more, with notes for that.
+        First with what follows a drag and what is kept; then, for an obstacle that rests, methods that do not follow a
+        drag are planned one after the other, and at last the depth of the arm's meshes is worked out. The task of ours
+        is `learned`.
 
         Raises:
             UnwantedError: it is cancelled, which is asked between parts of the work.
         """
-        slow = [method for method in _chosen(frame) if self._record(method, learned, frame).known is None]
+        beside = chosen(frame.scenario.view, frame.task.name)
+        results = {method: self._result(method, learned, frame) for method in ((OURS, *beside) if beside else ())}
+
+        def so_far(notes: Mapping[Method, str]) -> tuple[Compared, ...]:
+            known = {m: result.known or Compared(m, note=notes.get(m, WAITS)) for m, result in results.items()}
+            return tuple(self._of_frame(compared, frame, learned) for compared in known.values())
+
+        for method, result in results.items():
+            if method is OURS or method.live:
+                result.known = result.known or self._scored(method, frame, learned, cancelled)
+        yield so_far({})
+        slow = [method for method, result in results.items() if result.known is None]
         for k, method in enumerate(slow, start=1):
-            yield {method.name: f"planning … ({k} of {len(slow)})", **{later.name: NEXT for later in slow[k:]}}
-            self._plan(method, frame, learned, cancelled)
+            yield so_far({method: f"planning … ({k} of {len(slow)})", **dict.fromkeys(slow[k:], NEXT)})
+            results[method].known = self._scored(method, frame, learned, cancelled)
         if slow:
-            yield {}
-        for method in _chosen(frame) if frame.scenario.obstacle.parts else ():
-            if (record := self._record(method, learned, frame)).is_complete:
-                continue
-            if (known := record.known) is not None and known.scores is not None:
+            yield so_far({})
+        for result in results.values() if frame.scenario.obstacle.parts else ():
+            known = result.known
+            if known is not None and known.scores is not None and known.scores.arm_depth is None:
                 depth = self._arm_depth(known, frame, learned, cancelled)
-                record.known = replace(known, scores=replace(known.scores, arm_depth=depth))
-            record.is_complete = True
-            yield {}
+                result.known = replace(known, scores=replace(known.scores, arm_depth=depth))
+                yield so_far({})
 
     @kept(NEWEST, by=_around)
-    def _record(self, method: Method, learned: Learned, frame: Frame) -> _Record:
-        """What is known of a method around the obstacle of a frame: one place for all that is kept."""
-        return _Record(_ours(frame) if method is OURS else None)
+    def _result(self, method: Method, learned: Learned, frame: Frame) -> _Result:
+        """The place of all that is kept of a method around the obstacle of a frame."""
+        return _Result()
 
-    def _compared(self, method: Method, frame: Frame, learned: Learned, waiting: str) -> Compared:
-        """What is known of a method; `waiting` is its note while its motions are not."""
-        if method.live:
-            self._plan(method, frame, learned)
-        record = self._record(method, learned, frame)
-        known = record.known or Compared(method, note=waiting)
-        if not known.paths:
-            return known
-        rollout = frame.chosen if frame.chosen is not None and frame.chosen < len(learned.task.starts) else 0
-        shows_arm = frame.scenario.view.their_arm == method.name and len(known.times[rollout]) > 1
-        arm = self._arm(record, learned, rollout) if shows_arm else None
-        path, demonstration = known.paths[rollout], learned.task.paths[rollout]
-        return replace(known, rollout=rollout, curves=curves(path, demonstration, frame.scenario.obstacle), arm=arm)
-
-    def _plan(self, method: Method, frame: Frame, learned: Learned, cancelled: Cancelled = never) -> None:
-        """Plan a method's motions unless they are known; those that do not avoid are the same around all obstacles."""
-        record, obstacle = self._record(method, learned, frame), frame.scenario.obstacle
-        if record.known is None:
+    def _scored(self, method: Method, frame: Frame, learned: Learned, cancelled: Cancelled) -> Compared:
+        """A method's motions around the obstacle of a frame with their scores, or a note why there are none."""
+        if method is OURS:
+            return _ours(frame)
+        obstacle = frame.scenario.obstacle
+        try:
             known = self._planned(method, learned, obstacle if method.avoids else Union(), cancelled)
-            if known.scores is not None and not method.avoids:
-                known = replace(known, scores=replace(known.scores, hand_depth=hand_depth(known.paths, obstacle)))
-            record.known = known
+        except (NotFittedError, UnreachableError) as error:
+            return Compared(method, note=str(error))
+        if method.avoids or known.scores is None:
+            return known
+        return replace(known, scores=replace(known.scores, hand_depth=hand_depth(known.paths, obstacle)))
 
     @kept(NEWEST, by=lambda method, learned, obstacle, _: (method.name, learned, obstacle))
     def _planned(self, method: Method, learned: Learned, obstacle: Union, cancelled: Cancelled) -> Compared:
-        planner = self._planner(method, learned)
-        if isinstance(planner, str):
-            return Compared(method, note=planner)
-        try:
-            plan = planner(obstacle, learned.task.starts, cancelled)
-        except UnreachableError as error:
-            return Compared(method, note=str(error))
+        plan = self._planner(method, learned)(obstacle, learned.task.starts, cancelled)
         stays = sum(len(path) < 2 for path in plan.paths)
         notes = (*plan.warnings, *([f"{NO_WAY} from {stays} of {len(plan.paths)} starts"] if stays else []))
         paths = tuple(path if len(path) > 1 else np.repeat(path, 2, axis=0) for path in plan.paths)
@@ -137,45 +116,58 @@ class Comparison:
         return Compared(method, paths, plan.times, plan.joints, scores, "; ".join(notes))
 
     @kept(NEWEST, by=lambda method, learned: (method.name, learned))
-    def _planner(self, method: Method, learned: Learned) -> Planner | str:
-        """The planner of a method for a task, or why there is none."""
+    def _planner(self, method: Method, learned: Learned) -> Planner:
         if method.missing:
-            return f"needs {', '.join(method.missing)}: {INSTALL}"
-        try:
-            return method.fit(self._problem(learned))
-        except (NotFittedError, UnreachableError) as error:
-            return str(error)
+            raise NotFittedError(f"needs {', '.join(method.missing)}: {INSTALL}")
+        return method.fit(self._problem(learned))
 
     @kept(NEWEST)
     def _problem(self, learned: Learned) -> Problem:
         return problem_of(learned, self._follower)
 
-    @kept(NEWEST, by=lambda record, _, rollout: (record, rollout))
-    def _arm(self, record: _Record, learned: Learned, rollout: int) -> ArmMotion:
-        assert record.known is not None
-        q, times = self._joints(record.known, learned, rollout)
-        return ArmMotion(within_velocity_limits(times, q, self._follower.robot.velocity_limits), q, q)
+    def _of_frame(self, known: Compared, frame: Frame, learned: Learned) -> Compared:
+        """The same with the curves of the motion that the arm of a frame follows, and the arm where it is shown."""
+        if not known.paths:
+            return known
+        rollout = frame.chosen if frame.chosen is not None and frame.chosen < len(learned.task.starts) else 0
+        shows_arm = frame.scenario.view.their_arm == known.method.name and len(known.times[rollout]) > 1
+        drawn = curves(known.paths[rollout], learned.task.paths[rollout], frame.scenario.obstacle)
+        arm = self._arm(known, learned, rollout) if shows_arm else None
+        return replace(known, rollout=rollout, curves=drawn, arm=arm)
 
-    def _joints(self, known: Compared, learned: Learned, rollout: int) -> tuple[Array, Array]:
-        """Postures (N, n), rad, and times (N,), s, of a rollout: planned, or tracked from the demonstrated posture."""
+    @kept(NEWEST)
+    def _arm(self, known: Compared, learned: Learned, rollout: int) -> ArmMotion:
+        """The arm along a motion, as planned, or tracking it from the demonstrated posture."""
         times = known.times[rollout]
         if known.joints is not None:
-            return known.joints[rollout], times
-        at, start = np.unique(arm_samples(len(times))), self._problem(learned).postures[rollout][0]
-        return track(self._follower.robot, known.paths[rollout][at], start).q, times[at]
+            q = known.joints[rollout]
+        else:
+            at, start = np.unique(arm_samples(len(times))), self._problem(learned).postures[rollout][0]
+            q, times = track(self._follower.robot, known.paths[rollout][at], start).q, times[at]
+        return ArmMotion(within_velocity_limits(times, q, self._follower.robot.velocity_limits), q, q)
 
     def _arm_depth(self, known: Compared, frame: Frame, learned: Learned, cancelled: Cancelled) -> float | None:
         """How deep the arm's meshes enter the obstacle along motions, metres; None where it cannot follow."""
-        model, depth, ours = self._follower.robot.collision, 0.0, known.method is OURS
+        model, depth, is_ours = self._follower.robot.collision, 0.0, known.method is OURS
         try:
             moving = np.flatnonzero(frame.motion.nominal.moving).tolist()
-            for k in moving if ours else range(len(known.paths)):
+            for k in moving if is_ours else range(len(known.paths)):
                 end_if(cancelled)
-                q = arm_along(frame, k, self._follower)[0].q if ours else self._joints(known, learned, k)[0]
-                depth = max(depth, -model.nearest_to_obstacle(q, frame.scenario.obstacle).distance)
+                arm = arm_along(frame, k, self._follower)[0] if is_ours else self._arm(known, learned, k)
+                depth = max(depth, -model.nearest_to_obstacle(arm.q, frame.scenario.obstacle).distance)
         except UnreachableError:
             return None
         return depth
+
+
+def _ours(frame: Frame) -> Compared:
+    """Our motions from the task's starts, as the frame has them."""
+    num = len(frame.task.starts)
+    if frame.blocked or not frame.shaping[:num].all():
+        return Compared(OURS, note=frame.blocked[0].text if frame.blocked else f"{NO_WAY} from some starts")
+    paths = frame.rollouts[:num]
+    scores = scored(paths, frame.task, frame.goal, frame.scenario.obstacle)
+    return Compared(OURS, paths, frame.times[:num], scores=scores)
 
 
 def scored(paths: tuple[Array, ...], task: Task, goal: Array, obstacle: Union) -> Scores:
@@ -204,20 +196,3 @@ def curves(path: Array, demonstration: Array, obstacle: Union) -> Array:
     even = resample_by_arc_length(path, NUM_SAMPLES)
     depth = np.maximum(-obstacle.signed_distance(even), 0.0) if obstacle.parts else np.zeros(len(even))
     return np.column_stack([distance_from_path(even, demonstration), depth])
-
-
-def _chosen(frame: Frame) -> list[Method]:
-    """The methods that the view of a frame shows, ours first; none where it shows no others."""
-    others = chosen(frame.scenario.view, frame.task.name)
-    return [OURS, *others] if others else []
-
-
-def _ours(frame: Frame) -> Compared:
-    if frame.blocked:
-        return Compared(OURS, note=frame.blocked[0].text)
-    num = len(frame.task.starts)
-    if not frame.shaping[:num].all():
-        return Compared(OURS, note=f"{NO_WAY} from some starts")
-    paths = frame.rollouts[:num]
-    scores = scored(paths, frame.task, frame.goal, frame.scenario.obstacle)
-    return Compared(OURS, paths, frame.times[:num], scores=scores)

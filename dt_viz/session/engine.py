@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Hashable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import replace
+from itertools import islice
 from typing import TypeVar
 
 import numpy as np
@@ -33,7 +34,7 @@ from dt_viz.scheduler import SCHEDULER, Rank, checkpoint
 from dt_viz.session.certify import certify, clearance, uncertified, with_meshes
 from dt_viz.session.comparison import Comparison
 from dt_viz.session.drawing import Drawing, arm_along, rollouts_of
-from dt_viz.session.frame import Frame, Stage
+from dt_viz.session.frame import Compared, Frame, Stage
 from dt_viz.session.robot_loop import LiveArm
 from dt_viz.session.tasks_in_reach import where_followed
 from dt_viz.warning import MotionWarning
@@ -189,7 +190,8 @@ class Engine:
         if frame.motion.arm is not None and not frame.blocked:
             with self.refining(cancelled):
                 self.follower.reference_postures(frame.motion.nominal.learned)  # a drag may need them at once
-        yield from self._compared_at_rest(frame, cancelled)
+        if scenario.view.compared:
+            yield from self._compared_at_rest(frame, cancelled)
 
     def fine(self, scenario: Scenario, cancelled: Cancelled) -> Frame:
         """The frame of stage FINE of a learned scenario, which leaves no trace; it raises what `frames` raises."""
@@ -354,7 +356,7 @@ class Engine:
         frame = replace(frame, stage=stage, arm=arm, certificates=known, pictures=pictures)
         if view.health_plots and not live and frame.chosen is not None:
             frame = replace(frame, profiles=profiles(frame.motion, frame.drawn, frame.chosen, self.follower))
-        return self._compared(frame)
+        return replace(frame, comparison=next(self._compared(frame), ()))
 
     @kept(2, by=lambda frame, moves: (frame.motion, frame.chosen, moves))
     def _arm(self, frame: Frame, moves: bool) -> tuple[ArmMotion | None, tuple[MotionWarning, ...]]:
@@ -377,33 +379,26 @@ class Engine:
         key = frame.motion, frame.chosen
         return self._kept(frame.scenario, "with meshes", key, lambda: with_meshes(frame, self.follower.robot))
 
-    def _compared(self, frame: Frame, notes: Mapping[str, str] | None = None) -> Frame:
-        """The frame with other methods beside ours, as far as they are known; `notes` see `Comparison.of`."""
-        if not frame.scenario.view.compared:
-            return frame
-        return replace(frame, comparison=self.comparison.of(frame, self._plain(frame.scenario), notes))
-
-    def _plain(self, scenario: Scenario) -> Learned:
-        """What is learned for a scenario in the plain state, which other methods are compared with."""
-        return self.nominal(replace(scenario, state="plain", style="")).learned
+    def _compared(self, frame: Frame, cancelled: Cancelled = never) -> Iterator[tuple[Compared, ...]]:
+        """Other methods beside our motion in the plain state, as `Comparison.of`, if the view shows any."""
+        if frame.scenario.view.compared:
+            learned = self.nominal(replace(frame.scenario, state="plain", style="")).learned
+            yield from self.comparison.of(frame, learned, cancelled)
 
     def _compared_at_rest(self, frame: Frame, cancelled: Cancelled) -> Iterator[Frame]:
         """The last frame again and again, each with more of what is known of other methods."""
-        if not frame.scenario.view.compared:
-            return
 
         def asked() -> bool:
             checkpoint()
             return cancelled()
 
-        left = self.comparison.complete(frame, self._plain(frame.scenario), asked)
+        left = islice(self._compared(frame, asked), 1, None)  # the frame has the first
         while True:
             with self.refining(cancelled):
-                notes = next(left, None)
-                if notes is None:
-                    return
-                frame = self._compared(frame, notes)
-            yield frame
+                comparison = next(left, None)
+            if comparison is None:
+                return
+            yield replace(frame, comparison=comparison)
 
     # --- the robot ---
 

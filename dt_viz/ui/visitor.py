@@ -14,6 +14,7 @@ import numpy as np
 import viser
 from PIL import Image
 
+from dt_viz.baselines.registry import others
 from dt_viz.errors import Cancelled, DataError, FormatError, end_if, never
 from dt_viz.obstacles.shapes import TriangleObstacle, as_point
 from dt_viz.pictures.video import VIDEO_SUFFIXES, ffmpeg
@@ -28,7 +29,6 @@ from dt_viz.scenario.tasks import OWN, TASKS, Task
 from dt_viz.scheduler import SCHEDULER, Rank
 from dt_viz.serving.board import Share
 from dt_viz.session.arms import ArmStore
-from dt_viz.session.comparison import OTHERS
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.opening import Preview
@@ -80,7 +80,7 @@ def initial(task: Task) -> Scenario:
 
 def known_names(tasks: Collection[str], arms: Collection[str]) -> Known:
     """Return the names that a scenario may have on a page of these tasks and arms."""
-    return Known(tasks, arms, tuple(method.name for method in OTHERS))
+    return Known(tasks, arms, tuple(method.name for method in others()))
 
 
 def _takes_long(saved: Saved) -> bool:

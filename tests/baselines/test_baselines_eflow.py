@@ -7,7 +7,7 @@ from plans import eflow_weights as weights
 
 from dt_viz.baselines import repulsive
 from dt_viz.baselines.eflow import EFlowSystem, load_system
-from dt_viz.baselines.repulsive import RepulsivePlanner, repulsion
+from dt_viz.baselines.repulsive import plan, repulsion
 from dt_viz.evaluate.held_out import frechet
 from dt_viz.flows.diffeomorphisms import round_trip_error
 from dt_viz.motion.stack import LIVE
@@ -53,14 +53,14 @@ def test_rollouts_are_motions_of_the_velocity_until_it_turns_fast_near_the_goal(
 
 def test_motions_from_perturbed_starts_reach_the_goal_and_rest_while_the_potential_falls_at_the_speed(task, exact):
     def potential(y):
-        return np.linalg.norm(exact.transform.forward(y) - exact.latent_goal, axis=-1) / exact.scale
+        return np.linalg.norm(exact.transform.forward(y) - exact.latent_goal, axis=-1)
 
     starts = np.resize(task.starts, (40, 3)) + 0.05 * np.random.default_rng(2).normal(size=(40, 3))
     for path, times in zip(*exact.rollouts(starts, 0.02), strict=True):
         assert (np.diff(potential(path)) < 0).all() and (np.diff(times) > 0).all()
         np.testing.assert_allclose(path[-1], exact.goal, rtol=0, atol=1e-6)
     rates = np.einsum("nd,nd->n", exact.velocity(starts), central_differences(potential, starts, 1e-5))
-    np.testing.assert_allclose(rates, -exact.speed(exact.normalised(starts)), rtol=1e-6)
+    np.testing.assert_allclose(rates, -exact.speed(starts), rtol=1e-6)
     np.testing.assert_array_equal(exact.velocity(exact.goal[None]), 0)
 
 
@@ -69,8 +69,8 @@ def test_numpy_computes_what_torch_is_trained_on(task, exact, points):
     from assets.eflow_training import velocity
 
     arrays = {name: torch.tensor(array) for name, array in weights(task).items()}
-    x = exact.normalised(points)
     scale, shift = weights(task)["normalisation"]
+    x = exact.transform.to_frame(points)[:, : len(scale)] * scale + shift
     goal = torch.tensor(weights(task)["goal"] * scale + shift)
     found = velocity(torch.tensor(x), goal, arrays, arrays).numpy() / scale
     off_plane = exact.transform.to_frame(points)[:, x.shape[1] :]
@@ -122,40 +122,39 @@ def push():
 
 
 @pytest.fixture
-def planner(push):
+def system(push):
     arrays = weights(push, amplitude=0.003)
     arrays["speed_2"][:, -1] -= 1.5  # as slow as a demonstration
-    system = EFlowSystem.of(push, arrays)
-    return RepulsivePlanner(system)
+    return EFlowSystem.of(push, arrays)
 
 
-def test_motions_that_stay_out_of_range_are_those_of_eflow(push, planner):
+def test_motions_that_stay_out_of_range_are_those_of_eflow(push, system):
     far = Union((Sphere((0.0, 0.0, 3.0), 0.15),))
-    paths, times = planner.system.rollouts(push.starts, LIVE.spacing)
-    plan = planner(far, push.starts)
-    assert all(np.array_equal(a, b) for a, b in zip((*plan.paths, *plan.times), (*paths, *times), strict=True))
+    paths, times = system.rollouts(push.starts, LIVE.spacing)
+    found = plan(system, far, push.starts)
+    assert all(np.array_equal(a, b) for a, b in zip((*found.paths, *found.times), (*paths, *times), strict=True))
 
 
 @pytest.fixture
-def beside(planner, push):
+def beside(system, push):
     """An obstacle beside the first motion."""
-    (path,), _ = planner.system.rollouts(push.starts[:1], 0.012)
+    (path,), _ = system.rollouts(push.starts[:1], 0.012)
     return Union((Sphere(as_point(path[len(path) // 2] + [0.0, 0.03, 0.03]), 0.06),))
 
 
-def test_steps_follow_the_sum_of_both_velocities_and_eflow_goes_on_after_them(push, planner, beside):
-    plan = planner(beside, push.starts[:1])
-    path, times = plan.paths[0], plan.times[0]
+def test_steps_follow_the_sum_of_both_velocities_and_eflow_goes_on_after_them(push, system, beside):
+    found = plan(system, beside, push.starts[:1])
+    path, times = found.paths[0], found.times[0]
     assert (np.diff(times) > 0).all()
     stepped = np.flatnonzero(np.isclose(np.diff(times), 0.05, rtol=0, atol=1e-12))
     assert len(stepped) > 10
-    alone, pushed = planner.system.velocity(path[stepped]), repulsion(beside, path[stepped])[1]
+    alone, pushed = system.velocity(path[stepped]), repulsion(beside, path[stepped])[1]
     np.testing.assert_allclose(path[stepped + 1], path[stepped] + 0.05 * (alone + pushed), atol=1e-6)
     assert np.abs(0.05 * pushed).max() > 1e-4
-    assert np.linalg.norm(path[-1] - planner.system.goal) < 1e-6
+    assert np.linalg.norm(path[-1] - system.goal) < 1e-6
 
 
-def test_before_an_obstacle_on_the_goal_a_motion_stops(push, planner):
-    plan = planner(Union((Sphere(as_point(planner.system.goal), 0.1),)), push.starts[:2])
-    assert all(0.02 < np.linalg.norm(path[-1] - planner.system.goal) < 0.2 for path in plan.paths)
-    assert max(t[-1] for t in plan.times) < repulsive.LONGEST + 60
+def test_before_an_obstacle_on_the_goal_a_motion_stops(push, system):
+    found = plan(system, Union((Sphere(as_point(system.goal), 0.1),)), push.starts[:2])
+    assert all(0.02 < np.linalg.norm(path[-1] - system.goal) < 0.2 for path in found.paths)
+    assert max(t[-1] for t in found.times) < repulsive.LONGEST + 60

@@ -13,7 +13,7 @@ from plans import joints_of
 from assets.mpnet_training import initial, loss_and_gradient, train
 from dt_viz.baselines import mpnet
 from dt_viz.baselines.base import NotFittedError
-from dt_viz.baselines.mpnet import ARCHITECTURE, Network, Search
+from dt_viz.baselines.mpnet import Network, Search
 from dt_viz.baselines.postures import PlanningScene, fit_straight
 from dt_viz.errors import UnwantedError
 from dt_viz.obstacles.shapes import Sphere, as_point
@@ -26,7 +26,7 @@ needs_ompl = pytest.mark.skipif(find_spec("ompl") is None, reason="ompl is an ex
 def weights(seed=0):
     """Some weights, as training leaves them."""
     rng = np.random.default_rng(seed)
-    return {**initial(ARCHITECTURE.widths(6), rng), "centre": rng.normal(size=6), "scale": rng.uniform(0.1, 1, size=6)}
+    return {**initial(6, rng), "centre": rng.normal(size=6), "scale": rng.uniform(0.1, 1, size=6)}
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from pages import Page, frame_of
 from scenes import avoiding, changed
 
 from dt_viz.baselines.base import NotFittedError
-from dt_viz.baselines.registry import METHODS, problem_of
+from dt_viz.baselines.registry import METHODS, others, problem_of
 from dt_viz.errors import UnwantedError
 from dt_viz.evaluate.held_out import frechet
 from dt_viz.evaluate.table1 import drawn
@@ -19,11 +19,11 @@ from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.paper_scenes import FIG_6_PLACES
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.tasks import TASKS, TaskEntry, drawing_task
-from dt_viz.session.comparison import OTHERS, WAITS, curves, scored
+from dt_viz.session.comparison import WAITS, curves, scored
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Stage
 from dt_viz.ui.bindings import Bindings
-from dt_viz.ui.scene.comparison import APART, COLOURS, ComparedMotions
+from dt_viz.ui.scene.comparison import APART, ComparedMotions, colour_of
 from dt_viz.ui.scene.picture import Look
 from dt_viz.ui.tabs.compare import ComparePanel, hint, table_html
 
@@ -256,19 +256,19 @@ def test_what_is_not_installed_is_grey_with_the_command(server, monkeypatch):
 
 def test_methods_that_are_trained_in_advance_are_off_for_tasks_of_the_users_own(server, monkeypatch):
     monkeypatch.setattr("dt_viz.baselines.base.find_spec", lambda _module: True)
-    bound, trained = Bindings(), {method.title for method in OTHERS if method.weights}
+    bound, trained = Bindings(), {method.title for method in others() if method.weights}
     note = ComparePanel(server.gui, bound, lambda _suffix, _content: None).note
     handles = list(server.gui._gui_input_handle_from_uuid.values())
-    boxes = {box.label: box for box in handles if getattr(box, "label", "") in {method.title for method in OTHERS}}
+    boxes = {box.label: box for box in handles if getattr(box, "label", "") in {method.title for method in others()}}
     (their_arm,) = (handle for handle in handles if getattr(handle, "label", "") == "Their arm")
     view = View(compared=("eflow", "linear"), their_arm="eflow")
-    for task, others in (("draw_s", set()), ("own_data_1", trained), ("draw_s", set())):
+    for task, off in (("draw_s", set()), ("own_data_1", trained), ("draw_s", set())):
         bound.adopt(Scenario(task, view=view))
-        assert {title for title, box in boxes.items() if box.disabled} == others
-        assert {title for title, box in boxes.items() if box.value} == {"EFlow", "Linear"} - others
-        assert not others & set(their_arm.options) and len(their_arm.options) == 1 + len(boxes) - len(others)
-        assert their_arm.value == ("–" if others else "EFlow")
-        assert note.visible == bool(others)
+        assert {title for title, box in boxes.items() if box.disabled} == off
+        assert {title for title, box in boxes.items() if box.value} == {"EFlow", "Linear"} - off
+        assert not off & set(their_arm.options) and len(their_arm.options) == 1 + len(boxes) - len(off)
+        assert their_arm.value == ("–" if off else "EFlow")
+        assert note.visible == bool(off)
     assert "only for the shipped tasks" in note.content and all(title in note.content for title in trained)
     server.gui.reset()
 
@@ -276,7 +276,7 @@ def test_methods_that_are_trained_in_advance_are_off_for_tasks_of_the_users_own(
 def test_plots_have_a_curve_for_each_method_that_moves(server, beside):
     _, _, frames = beside
     panel = ComparePanel(server.gui, bound := Bindings(), lambda _suffix, _content: None)
-    scenario, plots = frames[-1].scenario, [plot for both in panel.plots for plot in both]
+    scenario, plots = frames[-1].scenario, [plot for each in panel.plots for plot in each.plots]
     bound.adopt(scenario)
     bound.report(frames[1])
     assert [len(plot.data) for plot in plots] == [3, 3, 2, 2]  # the slow one is not there yet; the window is hidden
@@ -284,25 +284,25 @@ def test_plots_have_a_curve_for_each_method_that_moves(server, beside):
     assert [len(plot.data) for plot in plots] == [4, 4, 2, 2]
     bound.adopt(replace(scenario, view=replace(scenario.view, large_plots=True)))
     assert [len(plot.data) for plot in plots] == [len(plot.series) for plot in plots] == [4] * 4
-    in_tab, in_window = (both[1].data for both in panel.plots)
+    in_tab, in_window = (each.plots[1].data for each in panel.plots)
     np.testing.assert_array_equal(in_tab, in_window)
     named = [compared.method.title for compared in frames[-1].comparison]
-    assert all(title in key.content for title in named for key in panel.keys)
+    assert all(title in each.key.content for title in named for each in panel.plots)
     bound.report(replace(frames[-1], comparison=()))
     assert len(plots[-1].data) == 4
     server.gui.reset()
 
 
 def test_motions_are_drawn_in_colours_of_their_own_with_names_apart(scene, beside):
-    assert set(COLOURS) == {method.name for method in OTHERS} and len(set(COLOURS.values())) == len(OTHERS)
+    assert len({colour_of(method) for method in METHODS.values()}) == len(METHODS)
     _, scenario, frames = beside
     picture = ComparedMotions(scene)
     picture.draw(frames[-1], Look())
-    assert list(picture.motions) == [SLOW, LIVE]
-    for name, motions in picture.motions.items():
+    assert list(picture.motions) == [METHODS[SLOW], METHODS[LIVE]]
+    for method, motions in picture.motions.items():
         assert motions.node.visible
         for lines in (motions.followed, motions.others):
-            np.testing.assert_array_equal(lines.node.colors, COLOURS[name])
+            np.testing.assert_array_equal(lines.node.colors, colour_of(method))
     apart = np.subtract(*(motions.label.position for motions in picture.motions.values()))
     assert np.linalg.norm(apart) > 0.8 * APART
     picture.draw(frame_of(scenario, rollouts=frames[-1].rollouts, goal=frames[-1].goal), Look())

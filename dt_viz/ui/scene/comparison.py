@@ -2,45 +2,50 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import cycle
 
 import numpy as np
 import viser
 
+from dt_viz.baselines.base import Method
+from dt_viz.baselines.registry import OURS, others
 from dt_viz.flows.fields import Array
 from dt_viz.metrics import distance_from_path
 from dt_viz.robot.robot import Robot
-from dt_viz.session.comparison import OTHERS, OURS
 from dt_viz.session.frame import Compared, Frame, Stage
 from dt_viz.ui.playback import Replay
 from dt_viz.ui.scene.arm import GhostArm
 from dt_viz.ui.scene.palette import LIGHT, STYLES, Colour
 from dt_viz.ui.scene.picture import Key, Lines, Look, Picture, add_label
 
-COLOURS: Mapping[str, Colour] = {
-    method.name: colour for method, colour in zip(OTHERS, cycle(LIGHT.compared), strict=False)
-}
-"""Colour of each method's motions, by its name."""
 APART = 0.045  # height of one name above another, metres
 
 
-def followed(frame: Frame) -> dict[str, Compared]:
-    """Return the methods beside ours of which a motion is followed, by their names: those that are seen."""
-    shown = [one for one in frame.comparison if one.method.name in COLOURS and len(one.paths) > one.rollout]
-    return {one.method.name: one for one in shown}
+def number_of(method: Method) -> int:
+    """Return the number of a method beside ours, by which the styles of compared motions have its colour."""
+    return others().index(method)
+
+
+def colour_of(method: Method) -> Colour:
+    """Return the colour of a method's motions on the page."""
+    return LIGHT.rollout if method is OURS else STYLES.compared.on(LIGHT, number_of(method))
+
+
+def followed(frame: Frame) -> list[Compared]:
+    """Return the methods beside ours of which a motion is followed: those that are seen."""
+    return [one for one in frame.comparison if one.method is not OURS and len(one.paths) > one.rollout]
 
 
 class _DrawnMotions:
     """Motions of one method, and its name beside them."""
 
-    def __init__(self, scene: viser.SceneApi, name: str, title: str) -> None:
-        node, number = f"/compared/{name}", list(COLOURS).index(name)
+    def __init__(self, scene: viser.SceneApi, method: Method) -> None:
+        node, number = f"/compared/{method.name}", number_of(method)
         self.node = scene.add_frame(node, show_axes=False)
         self.followed = Lines(scene, f"{node}/followed", STYLES.compared_followed, number)
         self.others = Lines(scene, f"{node}/others", STYLES.compared, number)
-        self.label = add_label(scene, f"{node}/name", title)
+        self.label = add_label(scene, f"{node}/name", method.title)
 
 
 class ComparedMotions(Picture):
@@ -49,14 +54,12 @@ class ComparedMotions(Picture):
     def __init__(self, scene: viser.SceneApi) -> None:
         super().__init__(scene.add_frame("/compared", show_axes=False, visible=False))
         self._scene = scene
-        self.motions: dict[str, _DrawnMotions] = {}  # of the methods that were ever shown
+        self.motions: dict[Method, _DrawnMotions] = {}  # of the methods that were ever shown
 
     @property
     def key(self) -> Key | None:
-        shown = [method for method in OTHERS if method.name in self.motions and self.motions[method.name].node.visible]
-        if not (shown and self.visible):
-            return None
-        return Key(((OURS.title, LIGHT.rollout), *((method.title, COLOURS[method.name]) for method in shown)))
+        shown = [method for method in others() if method in self.motions and self.motions[method].node.visible]
+        return Key(tuple((m.title, colour_of(m)) for m in (OURS, *shown))) if shown and self.visible else None
 
     @contextmanager
     def without_handles(self) -> Iterator[None]:
@@ -71,14 +74,14 @@ class ComparedMotions(Picture):
 
     def draw(self, frame: Frame, look: Look) -> None:
         shown = followed(frame)
-        for name in set(self.motions) - set(shown):
-            self.motions[name].node.visible = False
+        for method in set(self.motions) - {compared.method for compared in shown}:
+            self.motions[method].node.visible = False
         names: list[Array] = []  # places of names, each where its motion is farthest from ours, clear of the others
-        for name, compared in shown.items():
+        for compared in shown:
             ours = next(path for path in frame.rollouts[frame.chosen or 0 :] if len(path))
-            if name not in self.motions:
-                self.motions[name] = _DrawnMotions(self._scene, name, compared.method.title)
-            motions, rollout = self.motions[name], compared.rollout
+            if compared.method not in self.motions:
+                self.motions[compared.method] = _DrawnMotions(self._scene, compared.method)
+            motions, rollout = self.motions[compared.method], compared.rollout
             motions.followed.show([path := compared.paths[rollout]], look.theme)
             motions.others.show(compared.paths[:rollout] + compared.paths[rollout + 1 :], look.theme)
             motions.node.visible = True
@@ -106,7 +109,7 @@ class TheirArm:
             if compared.arm is not None:
                 self._replay.motion = compared.arm
                 for link in self._ghost.links:
-                    link.color = COLOURS[compared.method.name]
+                    link.color = colour_of(compared.method)
 
     def show(self, shown: bool) -> None:
         """Show or hide it; it is hidden until it has a motion."""

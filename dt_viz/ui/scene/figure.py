@@ -11,15 +11,15 @@ from PIL import Image, ImageColor, ImageDraw
 from scipy.ndimage import gaussian_filter
 
 from dt_viz.avoidance.bias import BiasPoint
+from dt_viz.baselines.registry import OURS
 from dt_viz.flows.fields import Array, Mask
 from dt_viz.obstacles.shapes import Obstacle, Point, nearest, rotation
 from dt_viz.pictures.figures import Arrows, Drawing, Levels, Strokes, check_installed, encoded, scene_figure
 from dt_viz.pictures.panels import PanelPicture
 from dt_viz.pictures.slice_fields import ColourPicture
 from dt_viz.scenario.slices import Slice, directions
-from dt_viz.session.comparison import OURS
 from dt_viz.session.frame import Compared, Frame
-from dt_viz.ui.scene.comparison import COLOURS, followed
+from dt_viz.ui.scene.comparison import followed, number_of
 from dt_viz.ui.scene.palette import LIGHT, STYLES, Colour, Style
 from dt_viz.ui.scene.picture import Key
 from dt_viz.ui.scene.slice_layers import CM2
@@ -151,7 +151,7 @@ def _scene(frame: Frame, title: str) -> Drawing:
     demonstrations = frame.task.paths if view.demonstrations else ()
     ghost = [path for place, path in enumerate(frame.ghost) if place == frame.chosen and view.ghost and moves]
     others = followed(frame)
-    beside = [path for compared in others.values() for path in compared.paths]
+    beside = [path for compared in others for path in compared.paths]
     area = frame.slice.holding([*frame.task.paths, *rollouts.values(), *beside])
     plane = _Plane.of(area, frame, frame.scenario.obstacles)
     strokes = [
@@ -160,7 +160,7 @@ def _scene(frame: Frame, title: str) -> Drawing:
         plane.strokes("demonstrations", STYLES.demonstration, demonstrations),
         plane.strokes("undisturbed", STYLES.ghost, ghost),
         plane.strokes("rollouts of the level", STYLES.level, () if frame.level is None else frame.levels[frame.level]),
-        *(part for name, compared in others.items() for part in _compared(plane, name, compared)),
+        *(part for compared in others for part in _compared(plane, compared)),
         plane.strokes(OURS.title if others else "rollouts", STYLES.rollout, own),
         plane.strokes("added rollouts", STYLES.added, added),
     ]
@@ -177,9 +177,9 @@ def _scene(frame: Frame, title: str) -> Drawing:
     return plane.drawing(title, strokes, points, field, STYLES.field, levels)
 
 
-def _compared(plane: _Plane, name: str, compared: Compared) -> Iterator[Strokes]:
+def _compared(plane: _Plane, compared: Compared) -> Iterator[Strokes]:
     """The motions of a method beside ours, the one that is named in the scene last."""
-    number, title = list(COLOURS).index(name), compared.method.title
+    number, title = number_of(compared.method), compared.method.title
     for style, is_named in ((STYLES.compared, False), (STYLES.compared_followed, True)):
         paths = [path for k, path in enumerate(compared.paths) if (k == compared.rollout) == is_named]
         yield plane.strokes(title, style, paths, number)

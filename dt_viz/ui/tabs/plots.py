@@ -17,10 +17,9 @@ from viser import uplot
 from dt_viz.flows.fields import Array
 from dt_viz.metrics import arc_length
 from dt_viz.motion.following import ArmMotion
-from dt_viz.motion.profiles import NUM_SAMPLES as NUM_OF_PROFILE
 from dt_viz.motion.profiles import Profiles
 from dt_viz.robot.robot import Robot
-from dt_viz.session.frame import Compared, Frame
+from dt_viz.session.frame import Frame
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.playback import Replay
@@ -57,33 +56,6 @@ def path_table(profiles: Profiles) -> dict[str, Array]:
         columns[f"lyapunov{suffix}"] = profile.lyapunov
         columns[f"distance_mm{suffix}"] = 1e3 * profile.distance
         columns[f"clearance_mm{suffix}"] = 1e3 * profile.clearance
-    return columns
-
-
-def scores_table(comparison: Sequence[Compared]) -> dict[str, list[object]]:
-    """Return the scores of compared methods, each a row; no score is an empty text."""
-    scores = [compared.scores for compared in comparison]
-    names = {
-        "to_demo_mm": "frechet",
-        "hand_in_mm": "hand_depth",
-        "arm_in_mm": "arm_depth",
-        "off_goal_mm": "goal_error",
-    }
-    table: dict[str, list[object]] = {"method": [compared.method.title for compared in comparison]}
-    for head, name in names.items():
-        values = [None if score is None else getattr(score, name) for score in scores]
-        table[head] = ["" if value is None else 1e3 * float(value) for value in values]
-    table["note"] = [compared.note for compared in comparison]
-    return table
-
-
-def curves_table(comparison: Sequence[Compared]) -> dict[str, Array]:
-    """Return the curves of compared methods along the path, from 0 to 1; of those that have some."""
-    columns: dict[str, Array] = {"path": np.linspace(0, 1, NUM_OF_PROFILE)}
-    for compared in comparison:
-        if compared.curves is not None:
-            columns[f"{compared.method.name}_distance_mm"] = 1e3 * compared.curves[:, 0]
-            columns[f"{compared.method.name}_depth_mm"] = 1e3 * compared.curves[:, 1]
     return columns
 
 
