@@ -16,8 +16,9 @@ from dt_viz.session.comparison import OTHERS, OURS
 from dt_viz.session.frame import Compared, Frame, Stage
 from dt_viz.ui.playback import Replay
 from dt_viz.ui.scene.arm import GhostArm
+from dt_viz.ui.scene.legend import Legend
 from dt_viz.ui.scene.palette import LIGHT, STYLES, Colour
-from dt_viz.ui.scene.picture import Key, Lines, Look, Picture, add_label
+from dt_viz.ui.scene.picture import Lines, Look, Picture, add_label
 
 COLOURS: Mapping[str, Colour] = {
     method.name: colour for method, colour in zip(OTHERS, cycle(LIGHT.compared), strict=False)
@@ -51,16 +52,9 @@ class ComparedMotions(Picture):
         self._scene = scene
         self.motions: dict[str, _DrawnMotions] = {}  # of the methods that were ever shown
 
-    @property
-    def key(self) -> Key | None:
-        shown = [method for method in OTHERS if method.name in self.motions and self.motions[method.name].node.visible]
-        if not (shown and self.visible):
-            return None
-        return Key(((OURS.title, LIGHT.rollout), *((method.title, COLOURS[method.name]) for method in shown)))
-
     @contextmanager
     def without_handles(self) -> Iterator[None]:
-        """Hide the names beside the motions: a picture has the key instead."""
+        """Hide the names beside the motions: a picture has the legend instead."""
         for motions in self.motions.values():
             motions.label.visible = False
         try:
@@ -71,6 +65,8 @@ class ComparedMotions(Picture):
 
     def draw(self, frame: Frame, look: Look) -> None:
         shown = followed(frame)
+        colours = [(method.title, COLOURS[method.name]) for method in OTHERS if method.name in shown]
+        self.legend = Legend(((OURS.title, LIGHT.rollout), *colours)) if shown else None
         for name in set(self.motions) - set(shown):
             self.motions[name].node.visible = False
         names: list[Array] = []  # places of names, each where its motion is farthest from ours, clear of the others
