@@ -65,12 +65,14 @@ class Sketchbook:
     paths: tuple[Array, ...]  # (T_i, 3) their preimages, the rollouts, metres
     memo: Memo = field(default_factory=Memo)
 
-    @kept(8, by=_on_slice)
     def generator(self, area: Slice, number: int) -> GeneratorPicture | None:
         """Return the generator of a flow; ψ applies number 1 first, and 0 stands for the mean over all flows."""
-        if self.flows is None:
-            return None
-        task, flows, number = self.task, self.flows.parts[::-1], min(number, len(self.flows.parts))
+        return None if self.flows is None else self._generator(area, min(number, len(self.flows.parts)))
+
+    @kept(8, by=_on_slice)
+    def _generator(self, area: Slice, number: int) -> GeneratorPicture:
+        assert self.flows is not None
+        task, flows = self.task, self.flows.parts[::-1]
         chosen = [flows[number - 1]] if number else flows
         motions: list[Array] = []
         for demonstration in task.demonstrations if number else ():
