@@ -32,7 +32,7 @@ from dt_viz.scenario.tour import STEPS, TASK
 from dt_viz.session.arms import ArmStore
 from dt_viz.session.frame import Stage
 from dt_viz.session.session import CHOICES
-from dt_viz.ui.scene.export import FORMATS, Order
+from dt_viz.ui.scene.export import FORMATS, SETTINGS, Order
 from dt_viz.ui.scene.figure import SUFFIXES
 from dt_viz.ui.scene.recording import drawn
 from dt_viz.ui.server import Server
@@ -48,7 +48,6 @@ SMALLEST, LARGEST, LARGEST_VIDEO = 64, 7680, 1920  # width and height of a pictu
 WINDOW = 1920  # largest width and height of the browser's window, pixels: the picture may be larger
 PATIENCE = 300.0  # longest time to wait for the page, and for its motion, seconds
 DRAWING = 4.0  # time that a browser takes for letters and surfaces once it has all that is drawn, seconds
-ALONG = 0.45  # part of its motion at which the arm is shown
 
 
 def make(options: argparse.Namespace, prog: str) -> int:
@@ -158,12 +157,13 @@ def _rendered(saved: Saved, order: Order, browser: str) -> bytes:
             if frame is None or frame.stage is not Stage.CERTIFIED or choices != wanted:
                 raise TimeoutError(f"the page shows no motion of {scenario.task}")
             if frame.arm is not None:
-                visitor.robot.playback.live.put(frame.arm.q[round(ALONG * (len(frame.arm.q) - 1))])
+                visitor.robot.playback.live.put(frame.arm.q[round(SETTINGS.along * (len(frame.arm.q) - 1))])
             visitor.robot.playback.advance(0.0)
             visitor.client.flush()
-            visitor.picture(Order(".png", (SMALLEST, SMALLEST), alone=True))  # the browser then has all that was sent
+            picture = visitor.studio.picture
+            picture(Order(".png", (SMALLEST, SMALLEST), alone=True))  # the browser then has all that was sent
             time.sleep(DRAWING)
-            return visitor.picture(order._replace(sight=saved.camera) if order.suffix == ".png" else order)
+            return picture(order._replace(pose=pose_of(saved.camera)) if order.suffix == ".png" else order)
     finally:
         server.close()
 

@@ -205,12 +205,7 @@ PROJECTION, HIDDEN = "projection", "dotted where hidden by an obstacle"
 
 
 def scene_figure(drawings: Sequence[Drawing]) -> Figure:
-    """Draw scenes side by side as wide as a paper's column, or as its page, with a scale bar and a legend.
-
-    Raises:
-        FormatError: matplotlib is not installed.
-    """
-    check_installed()
+    """Draw scenes side by side as wide as a paper's column, or as its page, with a scale bar and a legend."""
     from matplotlib.figure import Figure  # noqa: PLC0415 - an extra
 
     columns = len(drawings) if len(drawings) <= MOST_COLUMNS else min(MOST_COLUMNS, ceil(len(drawings) / 2))

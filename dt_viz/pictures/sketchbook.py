@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from dt_viz.flows.diffeomorphisms import Chain, Diffeomorphism, Placed
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.rollouts import Rays
 from dt_viz.flows.systems import DiffeomorphicSystem
-from dt_viz.memo import Memo
+from dt_viz.memo import Memo, kept
 from dt_viz.pictures.panels import Fit, PanelPicture, base_panel, generator_arrows, generator_panel, system_panel
 from dt_viz.pictures.slice_fields import ColourPicture, FieldPicture, OccupancyPicture, grid_lines
 from dt_viz.scenario.slices import Slice
@@ -48,34 +48,32 @@ class Pictures:
 NO_PICTURES = Pictures()
 
 
+def _on_slice(area: Slice, what: Hashable) -> Hashable:
+    """What a picture on a slice depends on that no obstacle changes."""
+    return area.key, what
+
+
+@dataclass(frozen=True, eq=False)
 class Sketchbook:
     """Makes pictures of one learned motion; parts that do not depend on the obstacle are computed once."""
 
-    def __init__(
-        self, task: Task, flows: Chain | None, system: DiffeomorphicSystem, rays: Rays, paths: tuple[Array, ...]
-    ) -> None:
-        """Begin with no picture.
-
-        Args:
-            task: task of the motion.
-            flows: flows that ψ is composed of, in the demonstrations' own units; None without an imitation.
-            system: system of the motion without further transforms, in the world.
-            rays: rays from ψ(starts) to ψ(goal).
-            paths: (T_i, 3) their preimages, the rollouts, metres.
-        """
-        self.task = task  # task of the motion
-        self._flows, self._system, self._rays, self._paths = flows, system, rays, paths
-        self._memo = Memo()
+    task: Task  # task of the motion
+    flows: Chain | None
+    """Flows that ψ is composed of, in the demonstrations' own units; None without an imitation."""
+    system: DiffeomorphicSystem  # system of the motion without further transforms, in the world
+    rays: Rays  # rays from ψ(starts) to ψ(goal)
+    paths: tuple[Array, ...]  # (T_i, 3) their preimages, the rollouts, metres
+    memo: Memo = field(default_factory=Memo)
 
     def generator(self, area: Slice, number: int) -> GeneratorPicture | None:
         """Return the generator of a flow; ψ applies number 1 first, and 0 stands for the mean over all flows."""
-        if self._flows is None:
-            return None
-        number, flows = min(number, len(self._flows.parts)), self._flows.parts[::-1]
-        return self._memo("generator", (number, area.key), lambda: self._generator(area, flows, number), newest=8)
+        return None if self.flows is None else self._generator(area, min(number, len(self.flows.parts)))
 
-    def _generator(self, area: Slice, flows: Sequence[Diffeomorphism], number: int) -> GeneratorPicture:
-        task, chosen = self.task, [flows[number - 1]] if number else flows
+    @kept(8, by=_on_slice)
+    def _generator(self, area: Slice, number: int) -> GeneratorPicture:
+        assert self.flows is not None
+        task, flows = self.task, self.flows.parts[::-1]
+        chosen = [flows[number - 1]] if number else flows
         motions: list[Array] = []
         for demonstration in task.demonstrations if number else ():
             num = len(demonstration.positions)
@@ -94,7 +92,7 @@ class Sketchbook:
 
         Level lines of the imitation's coordinates are found once, and bent by what is stacked on it.
         """
-        points, ends = self._memo("grid", (area.key, coarse), lambda: self._grid(area, coarse=coarse), newest=4)
+        points, ends = self._grid(area, coarse)
         longest = np.linalg.norm(np.diff(points[ends], axis=1), axis=2).max(initial=0.0)
         for transform in transforms:
             points = transform.inverse(points)
@@ -102,36 +100,27 @@ class Sketchbook:
         # nothing across an obstacle, whose two sides are neighbours below
         return lines[(np.linalg.norm(np.diff(lines, axis=1), axis=2) <= 3 * longest)[:, 0]]
 
-    def _grid(self, area: Slice, *, coarse: bool) -> tuple[Array, Indices]:
+    @kept(4, by=_on_slice)
+    def _grid(self, area: Slice, coarse: bool) -> tuple[Array, Indices]:
         """Find the points (N, 3) of the imitation's grid, metres, and the numbers (K, 2) of its segments' ends."""
-        lines = grid_lines(self._system, area, coarse=coarse)
+        lines = grid_lines(self.system, area, coarse=coarse)
         points, ends = np.unique(lines.reshape(-1, 3).round(9), axis=0, return_inverse=True)
         return points, ends.reshape(-1, 2)
 
-    def base(self, area: Slice, *, grid: bool) -> PanelPicture:
+    @kept(8, by=_on_slice)
+    def base(self, area: Slice, grid: bool) -> PanelPicture:
         """Return the base attractor on a panel where the slice is, with the lattice of the warped grid or without."""
-        return self._panel(
-            (BASE_TITLE, grid), area, lambda: base_panel(BASE_TITLE, Fit.of(self._rays, area), grid=grid)
-        )
+        return base_panel(BASE_TITLE, Fit.of(self.rays, area), grid=grid)
 
+    @kept(8, by=_on_slice)
     def imitation(self, area: Slice, title: str) -> PanelPicture:
         """Return the imitation, and what it imitates, on a panel where the slice is."""
-        return self._panel(
-            title,
-            area,
-            lambda: system_panel(title, self._system, self._paths, area, demonstrations=self.task.paths, coarse=False),
-        )
+        return system_panel(title, self.system, self.paths, area, demonstrations=self.task.paths, coarse=False)
 
+    @kept(8, by=_on_slice)
     def generating(self, area: Slice, title: str) -> PanelPicture | None:
         """Return what leads the base attractor's motions to the imitation: −V of all its flows."""
-        if self._flows is None:
-            return None
-        imitation = self._placed(self._flows)
-        return self._panel(title, area, lambda: generator_panel(title, imitation, area))
-
-    def _panel(self, key: Hashable, area: Slice, make: Callable[[], PanelPicture]) -> PanelPicture:
-        """Return a panel that no obstacle changes, made once."""
-        return self._memo("panel", (key, area.key), make, newest=8)
+        return None if self.flows is None else generator_panel(title, self._placed(self.flows), area)
 
 
 def in_frame(transform: Diffeomorphism) -> Chain | None:

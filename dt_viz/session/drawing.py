@@ -213,7 +213,7 @@ def _panel(panel: Panel, frame: Frame, book: Sketchbook, *, coarse: bool) -> Pan
     if panel.task:
         return book.imitation(book.task.slice, PLAIN_TITLE if panel.state == "plain" else book.task.title)
     if panel == BASE_PANEL:
-        return book.base(area, grid=frame.scenario.view.grid)
+        return book.base(area, frame.scenario.view.grid)
     if panel.level not in names:
         return None
     level, title = names.index(panel.level), f"field −V of {_name(panel.level)}"

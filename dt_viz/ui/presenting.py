@@ -201,7 +201,7 @@ class Lecture:
     def _move(self) -> None:
         with self._lock:
             presenter, viewers = self._presenter, list(self._viewers.values())
-        if presenter is None or presenter.visitor is None or (seen := presenter.visitor.seen) is None:
+        if presenter is None or presenter.visitor is None or (seen := presenter.visitor.camera.seen) is None:
             return
         for viewer in viewers:
             if viewer.follow is not None and viewer.follow.value:

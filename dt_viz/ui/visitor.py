@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -12,12 +12,10 @@ from types import MappingProxyType
 
 import numpy as np
 import viser
-from PIL import Image
 
 from dt_viz.baselines.registry import others
-from dt_viz.errors import Cancelled, DataError, FormatError, end_if, never
+from dt_viz.errors import Cancelled, DataError, never
 from dt_viz.obstacles.shapes import TriangleObstacle, as_point
-from dt_viz.pictures.video import VIDEO_SUFFIXES, ffmpeg
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.own import Own
 from dt_viz.scenario.relocation import in_world
@@ -38,29 +36,10 @@ from dt_viz.ui.bindings import EDITS
 from dt_viz.ui.keeping import Keeper
 from dt_viz.ui.panel import ControlPanel
 from dt_viz.ui.pen import Pen
-from dt_viz.ui.playback import Playback, Replay
-from dt_viz.ui.scene.camera import CameraController, Framing, Pose, Shot, shot_beside, shot_of, turned_shot, view_of
-from dt_viz.ui.scene.export import (
-    BROWSER,
-    LOOK,
-    MOTION,
-    SETTINGS,
-    TIMEOUT,
-    TIMEOUT_ALONE,
-    TURNTABLE,
-    WARP,
-    Order,
-    Studio,
-    as_png,
-    awaited,
-    filmed,
-    rendered,
-)
-from dt_viz.ui.scene.figure import Step, ignored
-from dt_viz.ui.scene.legend import Legend, legend_in
+from dt_viz.ui.playback import Playback
+from dt_viz.ui.scene.camera import CameraController, Pose
+from dt_viz.ui.scene.export import Studio
 from dt_viz.ui.scene.palette import DARK, LIGHT, Colour, Theme
-from dt_viz.ui.scene.picture import Key
-from dt_viz.ui.scene.recording import drawn
 from dt_viz.ui.scene.robot_scene import RobotScene
 from dt_viz.ui.scene.scene import ScenePictures
 from dt_viz.ui.scripts import KINDS, Window, report_window
@@ -139,18 +118,18 @@ class Visitor(Display):
         with SCHEDULER.slot(Rank.FIRST_PICTURE, cancelled), client.atomic():
             self.pictures = ScenePictures(client.scene, robot, lambda: self.session)
             self.robot = RobotScene(client, robot, Playback(engine.arm, self._pose))
-            self._studio = Studio(self.pictures, lambda: self.robot, self._changing)
+            self.studio = Studio(self)
             pen = Pen(self.pictures, lambda: self.robot, lambda: self.session, self._face)
-            self._camera = CameraController(client, lambda: self.robot.hand, robot.size, self._keeper.changed)
+            self.camera = CameraController(client, lambda: self.robot.hand, robot.size, self._keeper.changed)
             self._panel = ControlPanel(
                 client.gui,
                 titles,
                 robot,
                 titled,
-                self.picture,
+                self.studio.picture,
                 self._send,
                 partial(notify, client, seconds=BRIEF),
-                self._camera,
+                self.camera,
                 self._darken,
                 partial(self._preview, pen),
                 self._save,
@@ -175,7 +154,7 @@ class Visitor(Display):
 
     def reported(self, window: Window) -> None:
         """Frame the scene for the window's width, and open what the page's link asks for."""
-        self._camera.measured(window.width)
+        self.camera.measured(window.width)
         if window.link is not None:
             self._panel.follow(self.session, window.link)
 
@@ -184,13 +163,8 @@ class Visitor(Display):
         """What is shown, and its status, as HTML."""
         return self._panel.headline
 
-    @property
-    def seen(self) -> tuple[Pose, Framing] | None:
-        """Where the camera is, as the browser told, and the window; None where that is nowhere."""
-        return self._camera.seen
-
     def draw(self, frame: Frame, pace: Pace) -> None:
-        with self._studio.drawing:  # a video ends before what was edited meanwhile is drawn
+        with self.studio.drawing:  # a video ends before what was edited meanwhile is drawn
             self._draw(frame)
         if self._share is not None:
             self._share.count("edits", pace.num_edits)
@@ -201,14 +175,14 @@ class Visitor(Display):
         beside = tuple(panel.shown for panel in frame.pictures.panels)
         if frame.scenario.arm != (self.shown.scenario.arm if self.shown else ""):
             self._exchange(frame.scenario.arm)
-        settled = frame.stage is not Stage.ROLLOUTS and self._previews is False
-        others = settled and len(beside) != len(self._camera.panels)
+        settled = frame.stage is not Stage.ROLLOUTS and not self.previews
+        others = settled and len(beside) != len(self.camera.panels)
         if self.shown is not None and frame.task is not self.shown.task:
             self.robot.playback.resume()
         if self.shown is None or frame.task is not self.shown.task or others:
-            self._camera.look(frame.task, beside)
+            self.camera.look(frame.task, beside)
         if (pose := pose_of(self._keeper.sight(frame))) is not None:
-            self._camera.choose(pose)
+            self.camera.choose(pose)
             self._keeper.changed()
         with self.client.atomic():
             self.pictures.draw(frame)
@@ -220,7 +194,7 @@ class Visitor(Display):
         self.shown = frame
 
     def adopt(self, scenario: Scenario) -> None:
-        with self._changing():
+        with self.changing():
             self.pictures.adopt(scenario)
             self.robot.adopt(scenario.view, self.pictures.look)
         self._panel.adopt(scenario)
@@ -237,7 +211,7 @@ class Visitor(Display):
 
     def _made(self, tasks: Collection[str]) -> Saved:
         """What the visitor has made, beside the tour, with the task unless it is one of these."""
-        pose = self._panel.tour.pose if self.session.visits else self._camera.chosen
+        pose = self._panel.tour.pose if self.session.visits else self.camera.chosen
         scenario, lesson = self.session.own, self._panel.opening.lesson
         task = self.session.engines(scenario.arm).task(scenario.task)
         own = None if scenario.task in tasks else Own.of(task)
@@ -284,7 +258,7 @@ class Visitor(Display):
                 self.pictures.preview(seen, number)
                 self.robot.set_aside(True)
             if seen.task is not None and not before:
-                self._camera.look(seen.task)
+                self.camera.look(seen.task)
             self.client.flush()
         self._keeper.changed()
 
@@ -294,17 +268,17 @@ class Visitor(Display):
             self.pictures.preview(None, 0)
             self.robot.set_aside(False)
         if self.shown is not None:
-            self._camera.look(self.shown.task, tuple(panel.shown for panel in self.shown.pictures.panels))
+            self.camera.look(self.shown.task, tuple(panel.shown for panel in self.shown.pictures.panels))
         self.client.flush()
 
     def _face(self, board: Slice | None) -> None:
         """Move the camera straight before a board, or to where all is seen."""
         if self.shown is not None:
-            self._camera.look(self.shown.task, () if board is None else (board,))
+            self.camera.look(self.shown.task, () if board is None else (board,))
 
     def _pose(self) -> None:
         now = time.monotonic()
-        self._camera.turn(now)
+        self.camera.turn(now)
         with self._exchanging:
             if self.robot.playback.film is None:
                 self.robot.pose(now, self.pictures.look.tubes)
@@ -315,19 +289,19 @@ class Visitor(Display):
         """Draw the arm of a name in place of the one that is drawn."""
         engine = self.session.engines(name)
         robot = engine.follower.robot
-        with self._changing():
+        with self.changing():
             self.robot.remove()
             self.robot = RobotScene(self.client, robot, Playback(engine.arm, self._pose))
             self.pictures.take(self.client.scene, robot)
-            self.robot.paint(self._studio.theme)
+            self.robot.paint(self.studio.theme)
             self.robot.adopt(self.session.scenario.view, self.pictures.look)
-            self.robot.set_aside(self._previews is not False)
+            self.robot.set_aside(self.previews)
             self._panel.take(robot)
         self.robot.playback.begin(self.session.jobs, self.session.fail)  # and the one before ends
-        self._camera.reframe(arm_size=robot.size)
+        self.camera.reframe(arm_size=robot.size)
 
     @contextmanager
-    def _changing(self) -> Iterator[None]:
+    def changing(self) -> Iterator[None]:
         """Show what is changed within this block together, and have no other thread change the arm meanwhile."""
         with self.client.atomic(), self._exchanging:
             yield
@@ -339,116 +313,14 @@ class Visitor(Display):
 
     def _darken(self, dark: bool) -> None:
         """Begin the dark theme, or the light one, on the panel and in the scene."""
-        self._studio.theme = DARK if dark else LIGHT
-        self._dress(self._studio.theme)
-        self._studio.paint()
-
-    def picture(self, order: Order, step: Step = ignored, cancelled: Cancelled = never) -> bytes:
-        """Return what is shown as the content of a file; while a video is made the robot waits, and an edit ends it.
-
-        Raises:
-            FormatError: nothing is shown yet, there is no motion to film, it is edited meanwhile, or what draws or
-                encodes it is missing or fails.
-            TimeoutError: the browser does not answer.
-            UnwantedError: it is cancelled; the browser is not waited for.
-        """
-        if order.suffix in VIDEO_SUFFIXES:
-            return self._film(order, step, cancelled)
-        if order.suffix == ".png":
-            timeout = TIMEOUT_ALONE if order.alone else TIMEOUT
-            with self._studio.rendering():
-                (shot, _), legends = self._shot(order), self._legends
-                render = partial(rendered, self.client, order, shot, legends, 2 * timeout)
-                return awaited(lambda: as_png(render()), BROWSER, cancelled, timeout)
-        frame = self._something
-        follower = self.session.engines(frame.scenario.arm).follower
-        with self.session.engine.refining(cancelled):
-            return drawn(frame, order.suffix, follower, self._camera.chosen, step)
-
-    def _shot(self, order: Order) -> tuple[Shot, float]:
-        """Return the camera of a picture, and the distance of what it looks at, metres."""
-        if not order.alone:
-            return self._camera.shot(order.size), self._camera.depth
-        if (pose := pose_of(order.sight)) is None:
-            frame, whole = self._something, Framing(order.size, panel=0.0, narrow=0)
-            shot = shot_of(pose := view_of(frame.task, whole, panels=[panel.shown for panel in frame.pictures.panels]))
-        else:
-            shot = shot_beside(pose, shot_of(pose).wxyz, Framing(), order.size)
-        return shot, float(np.linalg.norm(pose[1] - pose[0]))
-
-    def _film(self, order: Order, step: Step, cancelled: Cancelled) -> bytes:
-        ffmpeg()
-        deadline = time.monotonic() + SETTINGS.patience
-        while not self.session.wait_idle(LOOK):
-            step(0.0)
-            if time.monotonic() > deadline:
-                raise TimeoutError(f"the scene was not at rest within {SETTINGS.patience:g} s")
-        scenario = self.session.scenario
-
-        def ended() -> bool:
-            shown = self._something.scenario.choices == scenario.choices and self._previews is False
-            if not shown or self.session.scenario is not scenario:
-                raise FormatError("the scene", "an edit while it was filmed", "none until the video is saved")
-            return cancelled()
-
-        with self._studio.drawing, self._filmed():
-            end_if(ended)
-            frame, reel, (first, depth), legends = self._something, Replay(), self._shot(order), self._legends
-            reel.motion = frame.arm
-            if order.what != TURNTABLE and (frame.blocked or (order.what == MOTION and frame.arm is None)):
-                found = frame.blocked[0].text if frame.blocked else "none that the arm follows"
-                raise FormatError("the motion", found, "one that is shown")
-
-            def show(part: float) -> Callable[[], Image.Image]:
-                shot, names = first, legends
-                if order.what == TURNTABLE:
-                    shot = turned_shot(first, depth, 2 * np.pi * part)
-                else:
-                    if order.what == WARP:
-                        warped = self.session.engine.fine(replace(scenario, warp=part), ended)
-                        reel.motion = warped.arm
-                        with self.client.atomic():
-                            self.pictures.draw(warped)
-                        names = [*filter(None, [legend_in(warped, scenario.view.colour)]), *self.pictures.keys]
-                    reel.seek((SETTINGS.along if order.what == WARP else part) * reel.duration)
-                    with self._exchanging:
-                        self.robot.playback.film = reel
-                        self.robot.pose(time.monotonic(), self.pictures.look.tubes)
-                return partial(rendered, self.client, order, shot, names, 2 * SETTINGS.patience)
-
-            seconds = {MOTION: min(reel.duration, SETTINGS.motion), TURNTABLE: SETTINGS.turn, WARP: SETTINGS.warp}
-            return filmed(show, seconds[order.what], order, step, ended)
-
-    @contextmanager
-    def _filmed(self) -> Iterator[None]:
-        """Hold all that moves, as it is rendered, and have it go on in the end as if nothing had been."""
-        playback = self.robot.playback
-        with self._exchanging:
-            playback.film = playback.arm
-        try:
-            with self._studio.rendering():
-                yield
-        finally:
-            if self.shown is not None:
-                with self.client.atomic():
-                    self.pictures.draw(self.shown)
-            with self._changing():
-                playback.film = None
-                self.robot.adopt(self.session.scenario.view, self.pictures.look)
-            self._camera.rest()
-            self.client.flush()
+        self.studio.theme = DARK if dark else LIGHT
+        self._dress(self.studio.theme)
+        self.studio.paint()
 
     @property
-    def _legends(self) -> list[Legend | Key]:
-        legend = self._panel.show.legend
-        return [*([] if legend is None else [legend]), *self.pictures.keys]
-
-    @property
-    def _something(self) -> Frame:
-        """The frame that is shown; raises FormatError where there is none yet."""
-        if self.shown is None:
-            raise FormatError("the scene", "nothing yet", "a scene that is shown")
-        return self.shown
+    def previews(self) -> bool:
+        """Whether takes that are not learned yet are seen in place of the motion."""
+        return self._previews is not False
 
     def _send(self, suffix: str, content: bytes) -> None:
         name = "-".join(filter(None, ("dt-viz", self.session.scenario.task, self.session.scenario.arm)))

@@ -103,8 +103,8 @@ def settled(page: Page) -> None:
 
 def look_from_the_top(page: Page) -> None:
     """Move the camera, as its first report may do, too."""
-    page.visitor._camera.look(TASKS["draw_s"]())
-    page.visitor._camera.view("Top")
+    page.visitor.camera.look(TASKS["draw_s"]())
+    page.visitor.camera.view("Top")
 
 
 def kept(browser: Browser) -> Saved:
@@ -795,7 +795,7 @@ def test_a_link_opens_a_scenario_that_the_server_offers_by_its_name(opened_for):
 def drawn(page: Page, scenario: Scenario, stage: Stage) -> None:
     """What the page does with the camera for a frame."""
     frame = frame_of(scenario, stage=stage, task=TASKS[scenario.task]())
-    camera, keeper = page.visitor._camera, page.visitor._keeper
+    camera, keeper = page.visitor.camera, page.visitor._keeper
     camera.look(frame.task)
     if (sight := keeper.sight(frame)) is not None:
         camera.choose((np.array(sight[0]), np.array(sight[1])))
@@ -805,17 +805,17 @@ def drawn(page: Page, scenario: Scenario, stage: Stage) -> None:
 def test_a_camera_that_is_moved_is_kept_and_one_that_is_not_is_none(opened_for):
     browser = Browser()
     page = opened_for(browser)
-    page.visitor._camera.look(TASKS["draw_s"]())
+    page.visitor.camera.look(TASKS["draw_s"]())
     page.session.edit("Warp", warp=0.5)
     settled(page)
     assert kept(browser).camera is None
-    page.visitor._camera.view("Top")
+    page.visitor.camera.view("Top")
     settled(page)
-    top = view_of(TASKS["draw_s"](), page.visitor._camera.framing, "Top")
+    top = view_of(TASKS["draw_s"](), page.visitor.camera.framing, "Top")
     camera = kept(browser).camera
     assert camera is not None
     np.testing.assert_allclose(camera, top)
-    page.visitor._camera.view("Home")
+    page.visitor.camera.view("Home")
     settled(page)
     assert kept(browser).camera is None
 

@@ -53,8 +53,8 @@ def test_a_legend_names_what_is_shown_with_the_scale_of_the_slice(page, at_rest,
     assert "<summary>Legend</summary>" in page.decode() and "det J" not in page.decode()
     shown = View(demonstrations=False, colour="det")
     frame = at_rest(replace(initial("draw_s"), view=shown), Stage.CERTIFIED)
-    assert [name for name, _ in key_of(frame).lines] == ["undisturbed", "rollouts", "obstacle", "goal"]
-    assert dict(key_of(frame).lines)["rollouts"] == LIGHT.rollout
+    assert [name for name, _ in key_of(frame).names] == ["undisturbed", "rollouts", "obstacle", "goal"]
+    assert dict(key_of(frame).names)["rollouts"] == LIGHT.rollout
     assert "det J: volume" in record(frame, engine.follower).decode()
 
 

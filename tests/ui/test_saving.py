@@ -123,6 +123,19 @@ def test_a_picture_is_saved_of_what_is_shown(saving, frame, kind, begin):
         assert b"__VISER_EMBED_DATA__" in content
 
 
+def test_a_picture_explains_the_colours_that_are_shown(saving, at_rest, initial):
+    pictures = saving.visitor.pictures
+    shown = View(colour="det"), View(colour="lyapunov"), View(colour="occupancy")
+    for view, title in zip(shown, ("det J: ", "Lyapunov value", "Learned occupancy"), strict=True):
+        scenario = replace(initial("draw_s"), view=view)
+        pictures.adopt(scenario)
+        pictures.draw(at_rest(scenario, Stage.LIVE))
+        (legend,) = pictures.legends
+        assert legend.title.startswith(title)
+    pictures.adopt(initial("draw_s"))
+    assert pictures.legends == []
+
+
 def test_a_second_press_cancels_and_the_button_comes_back(saving, frame, monkeypatch):
     began, goes_on = threading.Event(), threading.Event()
 
@@ -215,9 +228,9 @@ class TestFigure:
         picture = saving.visitor.pictures.layer("compared")
         picture.draw(frame, Look())
         picture.visible = True
-        drawn, key = figure._scene(frame, ""), picture.key
+        drawn, key = figure._scene(frame, ""), picture.legend
         picture.visible = False
-        in_scene = {(name, figure._hex(colour)) for name, colour in key.lines}
+        in_scene = {(name, figure._hex(colour)) for name, colour in key.names}
         assert len(in_scene) == 3 and in_scene <= {(part.label, part.colour) for part in drawn.strokes}
         assert {name for name, _ in in_scene} <= set(texts(render_figure(frame, ".svg")))
         for motions in picture.motions.values():

@@ -1,6 +1,5 @@
 """The slice in the page, without a browser: handles, colours and their legend, and what is shown beside a level."""
 
-import io
 from dataclasses import replace
 from typing import Any, cast
 
@@ -19,18 +18,19 @@ from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.frame import Stage
 from dt_viz.ui.scene.colour_scale import NUM_SHADES, from_oklab, oklab, ramp
 from dt_viz.ui.scene.draggables import MovableSlice, Obstacles
-from dt_viz.ui.scene.export import as_png, explained
-from dt_viz.ui.scene.legend import OCCUPANCY, drawn_onto, legend_of
+from dt_viz.ui.scene.legend import Legend, explained
 from dt_viz.ui.scene.palette import LIGHT, css
-from dt_viz.ui.scene.picture import Key, Look
+from dt_viz.ui.scene.picture import Look
 from dt_viz.ui.scene.rollouts import Rollouts
 from dt_viz.ui.scene.slice_layers import (
+    OCCUPANCY,
     OPACITY,
     VOLUME,
     ColourSlice,
     FieldArrows,
     Streamlines,
     inked,
+    legend_of,
     painted,
     scale_of,
 )
@@ -222,32 +222,34 @@ LEGENDS = {
 @pytest.mark.parametrize(("what", "height"), [("det", 540), ("lyapunov", 720), ("occupancy", 1080)])
 def test_a_saved_picture_has_the_legend_in_its_corner_and_nothing_else_is_changed(what, height):
     legend, blank = LEGENDS[what], Image.new("RGBA", (height * 16 // 9, height))
-    pixels = np.asarray(drawn_onto(blank, [legend]))
+    pixels = np.asarray(explained(blank, [legend], transparent=True))
     rows, columns = np.nonzero(pixels[..., 3])
     assert rows.min() > 0.8 * height and columns.max() < 0.65 * height
     assert np.asarray(blank)[..., 3].max() == 0
     # both ends of the scale are there, the first to the left of the last
+    assert legend.scale is not None
     ends = legend.scale.shades[[0, -1]].astype(int)
     found = [np.nonzero((np.abs(pixels[..., :3] - end).max(axis=-1) <= 2) & (pixels[..., 3] == 255)) for end in ends]
     assert found[0][1].min() < found[1][1].max()
-    for text in (legend.title, legend.note, *(text for _, text in legend.ticks)):
+    for text in (legend.title, *(name for name, _ in legend.names), *(text for _, text in legend.ticks)):
         assert text.isascii()  # the font has no other letters
 
 
 def test_a_saved_picture_is_white_behind_or_transparent():
     blank = Image.new("RGBA", (320, 180))
     for legends in ([], [OCCUPANCY]):
-        white = Image.open(io.BytesIO(as_png(explained(blank, legends, transparent=False))))
-        clear = Image.open(io.BytesIO(as_png(explained(blank, legends, transparent=True))))
+        white, clear = (explained(blank, legends, transparent=transparent) for transparent in (False, True))
         assert (white.mode, clear.mode) == ("RGB", "RGBA")
         assert white.getpixel((300, 10)) == (255, 255, 255) and clear.getpixel((300, 10)) == (0, 0, 0, 0)
         assert (np.asarray(white).min() < 255) == bool(legends)
 
 
 def test_the_key_of_methods_stands_above_the_legend_of_colours():
-    key, blank = Key((("Ours", (200, 80, 0)), ("EFlow", (0, 90, 200)))), Image.new("RGBA", (1280, 720))
-    both, alone = (np.asarray(drawn_onto(blank, legends)) for legends in ([OCCUPANCY, key], [OCCUPANCY]))
-    rows = [np.nonzero((both[..., :3] == colour).all(axis=-1))[0].mean() for _, colour in key.lines]
+    key, blank = Legend((("Ours", (200, 80, 0)), ("EFlow", (0, 90, 200)))), Image.new("RGBA", (1280, 720))
+    both, alone = (
+        np.asarray(explained(blank, legends, transparent=True)) for legends in ([OCCUPANCY, key], [OCCUPANCY])
+    )
+    rows = [np.nonzero((both[..., :3] == colour).all(axis=-1))[0].mean() for _, colour in key.names]
     top = np.nonzero(alone[..., 3])[0].min()
     assert rows[0] < rows[1] < top and (both[top:] == alone[top:]).all()
 
@@ -279,9 +281,9 @@ def test_the_panel_says_what_the_colours_mean_and_what_is_not_in_them(opened):
     assert panel.key.visible and "det J" in panel.key.content and panel.back.visible
     bound.adopt(seen(colour="occupancy"))
     bound.report(frame(pictures=Pictures(colour=picture_of(np.ones((4, 5))))))  # on its way when another was chosen
-    assert panel.legend == OCCUPANCY and "Learned occupancy" in panel.key.content
+    assert "Learned occupancy" in panel.key.content
     bound.adopt(changed(SCENARIO, space="cspace"))
     assert panel.note.visible and WHOLE_ARM_NOTE in panel.note.content
-    assert panel.legend is None and not panel.key.visible
+    assert not panel.key.visible
     bound.adopt(changed(SCENARIO, space="cspace", avoids=False))
     assert not panel.note.visible

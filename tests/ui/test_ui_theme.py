@@ -78,7 +78,7 @@ def test_a_picture_is_saved_in_light_colours_and_the_dark_theme_stays(page, monk
         return np.zeros((height, width, 4), np.uint8)
 
     monkeypatch.setattr(page.client, "get_render", render)
-    page.visitor.picture(Order(".png"))
+    page.visitor.studio.picture(Order(".png"))
     assert taken == [(light, None)] and colours(page) == dark != light
     assert np.array_equal(grounds[-1], background(DARK))
     choose(page, False)
@@ -92,7 +92,7 @@ def test_a_picture_by_itself_looks_as_a_saved_camera_beside_the_panel(page, monk
         return np.zeros((height, width, 4), np.uint8)
 
     monkeypatch.setattr(page.client, "get_render", render)
-    page.visitor.picture(Order(".png", alone=True, sight=(tuple(position), tuple(look_at))))
+    page.visitor.studio.picture(Order(".png", alone=True, pose=(position, look_at)))
     (shot,) = shots
     right, _down, ahead = Rotation.from_quat(np.roll(shot["wxyz"], -1)).as_matrix().T
     depth = np.linalg.norm(look_at - position)

@@ -16,8 +16,9 @@ from dt_viz.robot.robot import Robot
 from dt_viz.session.frame import Compared, Frame, Stage
 from dt_viz.ui.playback import Replay
 from dt_viz.ui.scene.arm import GhostArm
+from dt_viz.ui.scene.legend import Legend
 from dt_viz.ui.scene.palette import LIGHT, STYLES, Colour
-from dt_viz.ui.scene.picture import Key, Lines, Look, Picture, add_label
+from dt_viz.ui.scene.picture import Lines, Look, Picture, add_label
 
 APART = 0.045  # height of one name above another, metres
 
@@ -56,14 +57,9 @@ class ComparedMotions(Picture):
         self._scene = scene
         self.motions: dict[Method, _DrawnMotions] = {}  # of the methods that were ever shown
 
-    @property
-    def key(self) -> Key | None:
-        shown = [method for method in others() if method in self.motions and self.motions[method].node.visible]
-        return Key(tuple((m.title, colour_of(m)) for m in (OURS, *shown))) if shown and self.visible else None
-
     @contextmanager
     def without_handles(self) -> Iterator[None]:
-        """Hide the names beside the motions: a picture has the key instead."""
+        """Hide the names beside the motions: a picture has the legend instead."""
         for motions in self.motions.values():
             motions.label.visible = False
         try:
@@ -74,7 +70,12 @@ class ComparedMotions(Picture):
 
     def draw(self, frame: Frame, look: Look) -> None:
         shown = followed(frame)
-        for method in set(self.motions) - {compared.method for compared in shown}:
+        methods = {compared.method for compared in shown}
+        marks = [
+            (method.title, colour_of(method)) for method in (OURS, *others()) if method is OURS or method in methods
+        ]
+        self.legend = Legend(tuple(marks)) if shown else None
+        for method in set(self.motions) - methods:
             self.motions[method].node.visible = False
         names: list[Array] = []  # places of names, each where its motion is farthest from ours, clear of the others
         for compared in shown:

@@ -1,33 +1,36 @@
-"""Pictures and videos of the scene by the visitor's browser: rendered, waited for, decoded and encoded."""
+"""Files of what a page shows: the way from its frame to a PNG, a video, a figure for a paper, or a page that plays."""
 
 from __future__ import annotations
 
 import io
 import struct
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
+from itertools import pairwise, repeat
 from time import monotonic
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 from PIL import Image
 
-from dt_viz.errors import Cancelled, FormatError, end_if
+from dt_viz.errors import Cancelled, FormatError, end_if, never
 from dt_viz.pictures.video import VIDEO_SUFFIXES, Encoder
-from dt_viz.scenario.saved import Sight
+from dt_viz.scenario.scenario import Scenario
+from dt_viz.session.frame import Frame
+from dt_viz.session.session import Session
 from dt_viz.ui import patches
-from dt_viz.ui.scene.camera import Shot
-from dt_viz.ui.scene.figure import SUFFIXES, Step
-from dt_viz.ui.scene.legend import Legend, drawn_onto
+from dt_viz.ui.playback import Replay
+from dt_viz.ui.scene.camera import CameraController, Framing, Pose, Shot, shot_beside, shot_of, turned_shot, view_of
+from dt_viz.ui.scene.figure import SUFFIXES, Step, ignored
+from dt_viz.ui.scene.legend import explained
 from dt_viz.ui.scene.palette import LIGHT
-from dt_viz.ui.scene.picture import Key
+from dt_viz.ui.scene.recording import drawn
 from dt_viz.ui.scene.robot_scene import RobotScene
 from dt_viz.ui.scene.scene import ScenePictures
 
@@ -57,7 +60,7 @@ class FilmSettings:
     turn: float = 6.0  # duration of a turn
     warp: float = 4.0  # duration of the warp from 0 to 1
     rest: float = 1.0  # duration for which the end of a motion, or of the warp, stays
-    along: float = 0.45  # part of its motion at which the arm is shown while the warp runs
+    along: float = 0.45  # part of its motion at which the arm is shown in a picture alone, and while the warp runs
     patience: float = 20.0  # longest time to wait for the browser, or for ffmpeg, with each frame
 
 
@@ -72,7 +75,7 @@ class Order(NamedTuple):
     transparent: bool = False  # whether a PNG has no background; else it is white
     what: str = MOTION  # what a video shows: `MOTION`, `TURNTABLE` or `WARP`
     alone: bool = False  # whether all of it is framed in a PNG or a video; else as seen beside the panel
-    sight: Sight | None = None
+    pose: Pose | None = None
     """Camera whose view beside the panel, in a window of the usual size, is shown `alone` in place of all of it."""
 
 
@@ -91,72 +94,6 @@ def awaited(work: Callable[[], _Result], failed: str, cancelled: Cancelled, pati
         if monotonic() > deadline:
             raise TimeoutError(f"{failed} within {patience:g} s")
     return future.result()
-
-
-def rendered(
-    client: viser.ClientHandle, order: Order, shot: Shot, legends: Iterable[Legend | Key], timeout: float
-) -> Image.Image:
-    """Render the scene of a visitor; the server's event loop must not call this.
-
-    Args:
-        client: the visitor.
-        order: file that it is for.
-        shot: camera of the picture.
-        legends: what explains its colours, drawn onto it.
-        timeout: longest time to wait for the browser, seconds.
-
-    Raises:
-        FormatError: the browser gave no PNG of this size.
-        TimeoutError: the browser did not answer.
-    """
-    rgba = decoded(patches.rendered(client, order.size, shot._asdict(), timeout), order.size)
-    return explained(Image.fromarray(rgba, "RGBA"), legends, transparent=order.transparent)
-
-
-def explained(image: Image.Image, legends: Iterable[Legend | Key], *, transparent: bool) -> Image.Image:
-    """Return an RGBA image with legends; on white, as RGB, unless it is to be transparent."""
-    image = drawn_onto(image, legends)
-    if transparent:
-        return image
-    white = Image.new("RGBA", image.size, "white")
-    white.alpha_composite(image)
-    return white.convert("RGB")
-
-
-def as_png(image: Image.Image) -> bytes:
-    """Return an image as the content of a PNG file."""
-    file = io.BytesIO()
-    image.save(file, "PNG")
-    return file.getvalue()
-
-
-def filmed(
-    show: Callable[[float], Callable[[], Image.Image]], seconds: float, order: Order, step: Step, cancelled: Cancelled
-) -> bytes:
-    """Return a video as the content of a file; frames are rendered and encoded by other threads than this.
-
-    Args:
-        show: has the scene show a part, from 0 to 1, and returns a function that renders it.
-        seconds: duration without the rest at its end.
-        order: file; a turntable is to be looped.
-        step: takes the part that is done.
-        cancelled: see `awaited`.
-
-    Raises:
-        FormatError: the browser gives no frame of this size, or ffmpeg fails.
-        TimeoutError: the browser or ffmpeg takes too long.
-        UnwantedError: it is cancelled.
-    """
-    parts = np.linspace(0.0, 1.0, max(1, round(seconds * SETTINGS.rate)) + 1).tolist()
-    loops, patience = order.what == TURNTABLE, SETTINGS.patience
-    with Encoder(order.suffix, order.size, SETTINGS.rate) as encoder:
-        for k, part in enumerate(parts[:-1] if loops else parts, start=1):
-            end_if(cancelled)
-            frame = awaited(show(part), BROWSER, cancelled, patience).tobytes()
-            for _ in range(1 if k < len(parts) else 1 + round(SETTINGS.rest * SETTINGS.rate)):
-                awaited(partial(encoder.write, frame), "ffmpeg took no frame", cancelled, patience)
-            step(k / (len(parts) + 1))
-        return awaited(encoder.finish, "ffmpeg wrote no file", cancelled, patience)
 
 
 def decoded(content: bytes, size: tuple[int, int]) -> NDArray[np.uint8]:
@@ -192,35 +129,176 @@ def decoded(content: bytes, size: tuple[int, int]) -> NDArray[np.uint8]:
         raise FormatError("the browser", "a damaged PNG", accepted) from error
 
 
-class Studio:
-    """Paints a visitor's scene; what is rendered is in light colours, without handles."""
+class Page(Protocol):
+    """What a studio uses of a visitor's page."""
 
-    def __init__(
-        self,
-        pictures: ScenePictures,
-        robot: Callable[[], RobotScene],
-        changing: Callable[[], AbstractContextManager[object]],
-    ) -> None:
-        """Take the scene; `changing` returns a block within which no other thread changes the arm."""
+    client: viser.ClientHandle
+    pictures: ScenePictures
+    robot: RobotScene
+    camera: CameraController
+    session: Session
+    shown: Frame | None
+
+    @property
+    def previews(self) -> bool:
+        """Whether takes are shown in place of the frame."""
+        ...
+
+    def changing(self) -> AbstractContextManager[object]:
+        """Return a block within which no other thread changes the arm."""
+        ...
+
+
+class Studio:
+    """Makes files of what a page shows; what its browser renders is in light colours, without handles."""
+
+    def __init__(self, page: Page) -> None:
         self.theme = LIGHT  # theme of the page
         self.drawing = threading.Lock()  # held while a frame is drawn, or a video is made
-        self._pictures, self._robot, self._changing = pictures, robot, changing
-        self._renders = False
+        self._page, self._renders = page, False
 
     def paint(self) -> None:
         """Paint all in the colours of the page, or of what is rendered now."""
         theme = LIGHT if self._renders else self.theme
-        with self._changing():
-            self._pictures.paint(theme)
-            self._robot().paint(theme)
+        with self._page.changing():
+            self._page.pictures.paint(theme)
+            self._page.robot.paint(theme)
+
+    def picture(self, order: Order, step: Step = ignored, cancelled: Cancelled = never) -> bytes:
+        """Return what is shown as the content of a file; while a video is made the robot waits, and an edit ends it.
+
+        Raises:
+            FormatError: nothing is shown yet, there is no motion to film, it is edited meanwhile, or what draws or
+                encodes it is missing or fails.
+            TimeoutError: the browser does not answer.
+            UnwantedError: it is cancelled; the browser is not waited for.
+        """
+        page = self._page
+        if order.suffix in VIDEO_SUFFIXES:
+            return self._film(order, step, cancelled)
+        if order.suffix == ".png":
+            file, timeout = io.BytesIO(), TIMEOUT_ALONE if order.alone else TIMEOUT
+            with self._rendering():
+                self._rendered(order, self._shot(order)[0], cancelled, timeout).save(file, "PNG")
+            return file.getvalue()
+        frame = self._frame
+        follower = page.session.engines(frame.scenario.arm).follower
+        with page.session.engine.refining(cancelled):
+            return drawn(frame, order.suffix, follower, page.camera.chosen, step)
+
+    @property
+    def _frame(self) -> Frame:
+        """The frame that is shown; raises FormatError where there is none yet."""
+        if self._page.shown is None:
+            raise FormatError("the scene", "nothing yet", "a scene that is shown")
+        return self._page.shown
+
+    def _shot(self, order: Order) -> tuple[Shot, float]:
+        """Return the camera of a picture, and the distance of what it looks at, metres."""
+        camera, pose = self._page.camera, order.pose
+        if not order.alone:
+            return camera.shot(order.size), camera.depth
+        if pose is not None:
+            shot = shot_beside(pose, shot_of(pose).wxyz, Framing(), order.size)
+        else:
+            panels = [panel.shown for panel in self._frame.pictures.panels]
+            pose = view_of(self._frame.task, Framing(order.size, panel=0.0, narrow=0), panels=panels)
+            shot = shot_of(pose)
+        return shot, float(np.linalg.norm(pose[1] - pose[0]))
+
+    def _rendered(self, order: Order, shot: Shot, cancelled: Cancelled, patience: float) -> Image.Image:
+        """Have the browser render the scene, and explain its colours; the server's event loop must not call this.
+
+        Raises:
+            FormatError: the browser gave no PNG of this size.
+            TimeoutError: it did not answer within `patience`, seconds.
+            UnwantedError: it is cancelled; the browser is not waited for.
+        """
+        legends = self._page.pictures.legends
+
+        def render() -> Image.Image:
+            rgba = decoded(patches.rendered(self._page.client, order.size, shot._asdict(), 2 * patience), order.size)
+            return explained(Image.fromarray(rgba, "RGBA"), legends, transparent=order.transparent)
+
+        return awaited(render, BROWSER, cancelled, patience)
+
+    def _film(self, order: Order, step: Step, cancelled: Cancelled) -> bytes:
+        """Return a video as the content of a file, once the scene is at rest; see `picture`."""
+        session, deadline = self._page.session, monotonic() + SETTINGS.patience
+        while not session.wait_idle(LOOK):
+            step(0.0)
+            if monotonic() > deadline:
+                raise TimeoutError(f"the scene was not at rest within {SETTINGS.patience:g} s")
+        scenario = session.scenario
+
+        def ended() -> bool:
+            shown = self._frame.scenario.choices == scenario.choices and not self._page.previews
+            if not shown or session.scenario is not scenario:
+                raise FormatError("the scene", "an edit while it was filmed", "none until the video is saved")
+            return cancelled()
+
+        with Encoder(order.suffix, order.size, SETTINGS.rate) as encoder, self.drawing, self._filming():
+            for part, image in self._images(order, scenario, ended):
+                awaited(partial(encoder.write, image.tobytes()), "ffmpeg took no frame", ended, SETTINGS.patience)
+                step(part)
+            return awaited(encoder.finish, "ffmpeg wrote no file", ended, SETTINGS.patience)
+
+    def _images(self, order: Order, scenario: Scenario, ended: Cancelled) -> Iterator[tuple[float, Image.Image]]:
+        """Have the scene show a video's frames one after the other; yield each with the part that is done, to 1.
+
+        A turntable, which is to be looped, leaves out the last one; else that is repeated for the rest.
+        """
+        end_if(ended)
+        page, frame, reel, turns = self._page, self._frame, Replay(), order.what == TURNTABLE
+        if not turns and (frame.blocked or (order.what == MOTION and frame.arm is None)):
+            found = frame.blocked[0].text if frame.blocked else "none that the arm follows"
+            raise FormatError("the motion", found, "one that is shown")
+        first, depth = self._shot(order)
+        reel.motion = frame.arm
+        seconds = {MOTION: min(reel.duration, SETTINGS.motion), TURNTABLE: SETTINGS.turn, WARP: SETTINGS.warp}
+        num = max(1, round(seconds[order.what] * SETTINGS.rate))
+        for k in range(num if turns else num + 1):
+            end_if(ended)
+            part, shot = k / num, turned_shot(first, depth, 2 * np.pi * k / num) if turns else first
+            if order.what == WARP:
+                warped = page.session.engine.fine(replace(scenario, warp=part), ended)
+                reel.motion = warped.arm
+                with page.client.atomic():
+                    page.pictures.draw(warped)
+            if not turns:
+                reel.seek((SETTINGS.along if order.what == WARP else part) * reel.duration)
+                with page.changing():
+                    page.robot.playback.film = reel
+                    page.robot.pose(monotonic(), page.pictures.look.tubes)
+            image = self._rendered(order, shot, ended, SETTINGS.patience)
+            yield from repeat((part, image), 1 + round(SETTINGS.rest * SETTINGS.rate) * (k == num))
 
     @contextmanager
-    def rendering(self) -> Iterator[None]:
+    def _filming(self) -> Iterator[None]:
+        """Hold all that moves, as it is rendered, and restore the scene and what moved in the end."""
+        page, playback = self._page, self._page.robot.playback
+        with page.changing():
+            playback.film = playback.arm
+        try:
+            with self._rendering():
+                yield
+        finally:
+            if page.shown is not None:
+                with page.client.atomic():
+                    page.pictures.draw(page.shown)
+            with page.changing():
+                playback.film = None
+                page.robot.adopt(page.session.scenario.view, page.pictures.look)
+            page.camera.rest()
+            page.client.flush()
+
+    @contextmanager
+    def _rendering(self) -> Iterator[None]:
         """Show the scene as pictures of it are, on white, for as long as they take."""
         self._renders = True
         self.paint()
         try:
-            with self._pictures.without_handles(), self._robot().grip.hidden():
+            with self._page.pictures.without_handles(), self._page.robot.grip.hidden():
                 yield
         finally:
             self._renders = False

@@ -20,8 +20,8 @@ from dt_viz.pictures.slice_fields import ColourPicture
 from dt_viz.scenario.slices import Slice, directions
 from dt_viz.session.frame import Compared, Frame
 from dt_viz.ui.scene.comparison import followed, number_of
+from dt_viz.ui.scene.legend import Legend
 from dt_viz.ui.scene.palette import LIGHT, STYLES, Colour, Style
-from dt_viz.ui.scene.picture import Key
 from dt_viz.ui.scene.slice_layers import CM2
 
 Step = Callable[[float], None]
@@ -134,13 +134,13 @@ def render_figure(frame: Frame, suffix: str, step: Step = ignored) -> bytes:
         return encoded(figure, suffix)
 
 
-def key_of(frame: Frame) -> Key:
+def key_of(frame: Frame) -> Legend:
     """Return the names and colours of what the scene of a frame shows."""
     drawing = _scene(frame, "")
     named = {one.label: one.colour for one in drawing.strokes if one.paths}
     named |= {one.label: one.colour for one in drawing.levels if one.is_body}
     named |= {label: colour for label, (_, colour) in drawing.points.items()}
-    return Key(tuple((label, ImageColor.getrgb(colour)[:3]) for label, colour in named.items()))
+    return Legend(tuple((label, ImageColor.getrgb(colour)[:3]) for label, colour in named.items()))
 
 
 def _scene(frame: Frame, title: str) -> Drawing:

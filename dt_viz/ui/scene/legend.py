@@ -1,4 +1,4 @@
-"""Legends of the colours on the slice, for the panel and for exported pictures."""
+"""Legends: names of what is drawn, and scales of colours, as HTML and for exported pictures."""
 
 from __future__ import annotations
 
@@ -6,106 +6,83 @@ import html
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-import numpy as np
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 
-from dt_viz.pictures.slice_fields import ColourPicture
-from dt_viz.scenario.scenario import SliceColour
-from dt_viz.session.frame import Frame
 from dt_viz.ui.scene.colour_scale import NUM_SHADES, Scale
-from dt_viz.ui.scene.palette import LIGHT, Colour, css
-from dt_viz.ui.scene.picture import INK, Key, plate
-from dt_viz.ui.scene.slice_layers import DET_DECADES, OCCUPANCY_SCALE, scale_of
+from dt_viz.ui.scene.palette import Colour, css
+
+INK: Colour = (52, 58, 68)  # colour of the text in exported pictures
 
 
 @dataclass(frozen=True)
 class Legend:
-    """A scale of colours with numbers, from left to right. Texts are ASCII: Pillow's own font has hardly more."""
+    """Names of colours, below a scale of them from left to right if there is one.
 
-    title: str  # quantity with its unit
-    scale: Scale
-    ticks: tuple[tuple[float, str], ...]  # values and their labels
-    note: str = ""  # text below the scale
-    swatch: Colour | None = None  # colour that the note explains
+    Texts are ASCII: Pillow's own font has hardly more.
+    """
+
+    names: tuple[tuple[str, Colour | None], ...]  # names or notes, each with its colour, if it has one
+    title: str = ""  # quantity of the scale, with its unit
+    scale: Scale | None = None
+    ticks: tuple[tuple[float, str], ...] = ()  # values of the scale and their labels
 
     @property
     def html(self) -> str:
         """HTML for the panel."""
+        look = "display:inline-block;width:1.6em;height:0.4em;vertical-align:0.15em;margin-right:0.6em;background:"
+        marks = [f"<span style='{look}{css(colour)}'></span>" if colour else "" for _, colour in self.names]
+        names = "".join(
+            f"<div>{mark}{html.escape(name)}</div>" for mark, (name, _) in zip(marks, self.names, strict=True)
+        )
+        if self.scale is None:
+            return names
         stops = ",".join(f"rgb({r},{g},{b})" for r, g, b in self.scale.shades[:: NUM_SHADES // 16].tolist())
         numbers = "".join(
             f"<span style='position:absolute;left:{at:.1f}%;transform:translateX(-{at:.1f}%)'>"
             f"{html.escape(text)}</span>"
             for at, text in ((100 * self.scale.relative(value), text) for value, text in self.ticks)
         )
-        mark = ""
-        if self.swatch:
-            look = f"display:inline-block;width:1.2em;height:0.7em;background:{css(self.swatch)}"
-            mark = f"<span style='{look}'></span> "
         return (
             f"<div style='font-size:0.8em;padding:0.2em 1.6em 0.5em;line-height:1.4'>{html.escape(self.title)}"
             f"<div style='height:0.8em;border-radius:2px;background:linear-gradient(to right,{stops})'></div>"
-            f"<div style='position:relative;height:1.5em'>{numbers}</div>{mark}{html.escape(self.note)}</div>"
+            f"<div style='position:relative;height:1.5em'>{numbers}</div>{names}</div>"
         )
 
     def drawn(self, em: int) -> Image.Image:
-        """Draw the legend as an RGBA image in type of a size in pixels."""
-        line, left, width = round(1.45 * em), round(1.6 * em), 24 * em
-        card, draw, font = plate(width + 2 * left, (4 + bool(self.note)) * line, em)
-        draw.text((left, line), self.title, INK, font, anchor="lm")
-        shades = Image.fromarray(self.scale.shades[None]).resize((width, round(0.8 * em)), Image.Resampling.BILINEAR)
-        card.paste(shades, (left, round(1.55 * line)))
-        for value, text in self.ticks:
-            draw.text((left + self.scale.relative(value) * width, round(2.9 * line)), text, INK, font, anchor="mm")
-        if self.note:
-            start = left
-            if self.swatch:
-                low = 3.95 * line
-                draw.rectangle((left, low - 0.35 * em, left + 1.2 * em, low + 0.35 * em), fill=self.swatch)
-                start += round(1.7 * em)
-            draw.text((start, round(3.95 * line)), self.note, INK, font, anchor="lm")
+        """Draw it on an almost opaque plate, as an RGBA image in type of a size in pixels."""
+        font, line, left = ImageFont.load_default(em), round(1.45 * em), round(1.4 * em)
+        indents = [round(2.2 * em) if colour else 0 for _, colour in self.names]
+        widths = [font.getlength(name) + indent for indent, (name, _) in zip(indents, self.names, strict=True)]
+        above, width = (0, round(max(widths))) if self.scale is None else (3 * line, 24 * em)
+        card = Image.new("RGBA", (width + 2 * left, above + (len(self.names) + 1) * line))
+        draw = ImageDraw.Draw(card)
+        draw.rounded_rectangle((0, 0, card.width - 1, card.height - 1), radius=em // 2, fill=(255, 255, 255, 225))
+        if self.scale is not None:
+            draw.text((left, line), self.title, INK, font, anchor="lm")
+            shades = Image.fromarray(self.scale.shades[None])
+            card.paste(shades.resize((width, round(0.8 * em)), Image.Resampling.BILINEAR), (left, round(1.55 * line)))
+            for value, text in self.ticks:
+                at = left + self.scale.relative(value) * width
+                draw.text((at, round(2.9 * line)), text, INK, font, anchor="mm")
+        for k, (indent, (name, colour)) in enumerate(zip(indents, self.names, strict=True), start=1):
+            middle = above + k * line
+            if colour:
+                draw.line((left, middle, left + round(1.6 * em), middle), colour, max(round(0.4 * em), 2))
+            draw.text((left + indent, middle), name, INK, font, anchor="lm")
         return card
 
 
-def drawn_onto(image: Image.Image, legends: Iterable[Legend | Key]) -> Image.Image:
-    """Draw legends onto a copy of an RGBA image, one above the other in its lower left corner, scaled to its height."""
+def explained(image: Image.Image, legends: Iterable[Legend], *, transparent: bool) -> Image.Image:
+    """Return an RGBA image with legends, scaled to its height, one above the other in its lower left corner.
+
+    It is on white, as RGB, unless it is to be transparent.
+    """
     whole, em = image.copy(), round(0.022 * image.height)
+    if not transparent:
+        whole = Image.alpha_composite(Image.new("RGBA", image.size, "white"), whole)
     bottom = image.height - em
     for legend in legends:
         card = legend.drawn(em)
         whole.alpha_composite(card, (em, bottom - card.height))
         bottom -= card.height + em // 2
-    return whole
-
-
-OCCUPANCY = Legend(
-    "Learned occupancy: how likely something is there",
-    OCCUPANCY_SCALE,
-    tuple((p, f"{p:g}") for p in (0, 0.25, 0.5, 0.75, 1)),
-    "Bold line: its level 0.5. Thin line: the true outline",
-)
-
-
-def legend_in(frame: Frame, colour: SliceColour) -> Legend | None:
-    """Return the legend of a colour on the slice of a frame; None if the frame has no picture of it."""
-    picture = frame.pictures.colour
-    if colour == "occupancy":
-        return OCCUPANCY
-    return legend_of(picture) if picture is not None and picture.what == colour else None
-
-
-def legend_of(picture: ColourPicture) -> Legend:
-    """Return the legend of a picture."""
-    scale = scale_of(picture)
-    if picture.what == "det":
-        decades = range(-DET_DECADES, DET_DECADES + 1)
-        return Legend(
-            "det J: volume in base space for volume here",
-            scale,
-            tuple((d, f"{10.0**d:g}") for d in decades),
-            "0 or less: folded, no diffeomorphism",
-            LIGHT.folded,
-        )
-    ticks = np.linspace(0, scale.high, 5).tolist()
-    return Legend(
-        "Lyapunov value, square cm per second", scale, tuple((v, f"{v:g}") for v in ticks), "Every motion goes down"
-    )
+    return whole if transparent else whole.convert("RGB")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
@@ -13,11 +12,11 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 import viser
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
 
 from dt_viz.flows.fields import Array
 from dt_viz.session.frame import Frame
-from dt_viz.ui.scene.palette import LIGHT, Colour, Style, Theme, css, linear
+from dt_viz.ui.scene.legend import Legend
+from dt_viz.ui.scene.palette import LIGHT, Style, Theme, linear
 from dt_viz.ui.scene.tubes import RolloutTubes
 
 
@@ -85,53 +84,11 @@ class Look:
     tubes: RolloutTubes = field(default_factory=RolloutTubes)  # tubes of the frame's rollouts
 
 
-INK: Colour = (52, 58, 68)  # colour of the text in exported pictures
-Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
-
-
-@dataclass(frozen=True)
-class Key:
-    """Names of lines in a picture, each with its colour."""
-
-    lines: tuple[tuple[str, Colour], ...]
-
-    @property
-    def html(self) -> str:
-        """HTML of the key, a line for each name."""
-        mark = "display:inline-block;width:1.6em;height:0.25em;vertical-align:0.25em;margin-right:0.6em"
-        return "".join(
-            f"<div><span style='{mark};background:{css(colour)}'></span>{html.escape(name)}</div>"
-            for name, colour in self.lines
-        )
-
-    def drawn(self, em: int) -> Image.Image:
-        """Draw the key as an RGBA image in type of a size in pixels."""
-        line, left, stroke = round(1.45 * em), round(0.8 * em), round(1.6 * em)
-        widest = max(ImageFont.load_default(em).getlength(name) for name, _ in self.lines)
-        card, draw, font = plate(round(widest) + 3 * left + stroke, (len(self.lines) + 1) * line, em)
-        for k, (name, colour) in enumerate(self.lines, start=1):
-            draw.line((left, k * line, left + stroke, k * line), colour, max(em // 4, 2))
-            draw.text((2 * left + stroke, k * line), name, INK, font, anchor="lm")
-        return card
-
-
-def plate(width: int, height: int, em: int) -> tuple[Image.Image, ImageDraw.ImageDraw, Font]:
-    """Return an almost opaque plate of a size in pixels, what draws on it, and a font."""
-    card = Image.new("RGBA", (width, height))
-    draw = ImageDraw.Draw(card)
-    draw.rounded_rectangle((0, 0, width - 1, height - 1), radius=em // 2, fill=(255, 255, 255, 225))
-    return card, draw, ImageFont.load_default(em)
-
-
 class Picture(Shown, ABC):
     """A part of the scene that is drawn from frames."""
 
+    legend: Legend | None = None  # what explains its colours or lines in a saved picture, if anything does
     _sources: tuple[object, ...] = ()  # what it was drawn from last
-
-    @property
-    def key(self) -> Key | None:
-        """What names its lines in a saved picture; None where nothing is to be named."""
-        return None
 
     @contextmanager
     def without_handles(self) -> Iterator[None]:

@@ -13,9 +13,9 @@ from dt_viz.ui.patches import Tape
 from dt_viz.ui.playback import Playback
 from dt_viz.ui.scene.camera import Framing, Pose, view_of
 from dt_viz.ui.scene.figure import Step, ignored, key_of, render_figure
-from dt_viz.ui.scene.legend import legend_in
 from dt_viz.ui.scene.robot_scene import RobotScene
 from dt_viz.ui.scene.scene import ScenePictures
+from dt_viz.ui.scene.slice_layers import legend_in
 
 HOLD = """
 const clock = Date.now, curtain = document.createElement('canvas');

@@ -20,8 +20,9 @@ from dt_viz.session.session import Session
 from dt_viz.ui.scene.arm import ArmSequence
 from dt_viz.ui.scene.comparison import ComparedMotions
 from dt_viz.ui.scene.draggables import BiasPoints, MovableSlice, Obstacles, Starts
+from dt_viz.ui.scene.legend import Legend
 from dt_viz.ui.scene.palette import LIGHT, STYLES, Theme
-from dt_viz.ui.scene.picture import Key, Look, Picture, add_ball, add_label
+from dt_viz.ui.scene.picture import Look, Picture, add_ball, add_label
 from dt_viz.ui.scene.rollouts import LevelRollouts, Rollouts, Takes, demonstrations, ghost
 from dt_viz.ui.scene.slice_layers import (
     ColourSlice,
@@ -116,9 +117,10 @@ class ScenePictures:
         return self._by_view[view]
 
     @property
-    def keys(self) -> list[Key]:
-        """What names lines in a saved picture."""
-        return [key for picture in self._by_view.values() if (key := picture.key) is not None]
+    def legends(self) -> list[Legend]:
+        """What explains the colours and lines that are shown, in a saved picture."""
+        pictures = *dict.fromkeys(self._by_colour.values()), *self._by_view.values()
+        return [picture.legend for picture in pictures if picture.visible and picture.legend is not None]
 
     def take(self, scene: viser.SceneApi, robot: Robot) -> None:
         """Show another arm from now on."""

@@ -12,9 +12,11 @@ from dt_viz.flows.fields import Array
 from dt_viz.obstacles.shapes import Point
 from dt_viz.pictures.panels import PanelPicture
 from dt_viz.pictures.slice_fields import ColourPicture
+from dt_viz.scenario.scenario import SliceColour
 from dt_viz.scenario.slices import Slice, directions
 from dt_viz.session.frame import Frame
 from dt_viz.ui.scene.colour_scale import NUM_SHADES, Scale, diverging, ramp
+from dt_viz.ui.scene.legend import Legend
 from dt_viz.ui.scene.palette import LIGHT, STYLES, Theme
 from dt_viz.ui.scene.picture import Arrows, Lines, Look, Picture, add_ball, add_label, assign
 from dt_viz.ui.scene.tubes import Tubes, middles_of
@@ -30,6 +32,12 @@ VOLUME, LYAPUNOV = diverging(LIGHT.volume), ramp(LIGHT.lyapunov)
 _LIKELY = np.linspace(0, MOST_OPAQUE, NUM_SHADES)[:, None]
 OCCUPANCY_SCALE = Scale(np.round(255 + _LIKELY * (np.array(LIGHT.occupancy) - 255)).astype(np.uint8), 0.0, 1.0)
 """Colours of the occupancy on white."""
+OCCUPANCY = Legend(
+    (("Bold line: its level 0.5. Thin line: the true outline", None),),
+    "Learned occupancy: how likely something is there",
+    OCCUPANCY_SCALE,
+    tuple((p, f"{p:g}") for p in (0, 0.25, 0.5, 0.75, 1)),
+)
 
 
 class FieldArrows(Picture):
@@ -91,6 +99,7 @@ class ColourSlice(Picture):
     def draw(self, frame: Frame, look: Look) -> None:
         picture = frame.pictures.colour
         if picture is not None and self._is_new(picture, look.theme):
+            self.legend = legend_of(picture)
             self.image.show(picture.area, painted(picture))
             self.lines.show_segments(picture.lines, look.theme)
 
@@ -100,6 +109,25 @@ def scale_of(picture: ColourPicture) -> Scale:
     if picture.what == "det":
         return Scale(VOLUME, -DET_DECADES, DET_DECADES)
     return Scale(LYAPUNOV, 0.0, _rounded_up(CM2 * float(np.nanmax(picture.values, initial=1e-9))))
+
+
+def legend_in(frame: Frame, colour: SliceColour) -> Legend | None:
+    """Return the legend of a colour on the slice of a frame; None if the frame has no picture of it."""
+    picture = frame.pictures.colour
+    if colour == "occupancy":
+        return OCCUPANCY
+    return legend_of(picture) if picture is not None and picture.what == colour else None
+
+
+def legend_of(picture: ColourPicture) -> Legend:
+    """Return the legend of a picture."""
+    scale = scale_of(picture)
+    if picture.what == "det":
+        ticks = tuple((d, f"{10.0**d:g}") for d in range(-DET_DECADES, DET_DECADES + 1))
+        folds = ("0 or less: folded, no diffeomorphism", LIGHT.folded)
+        return Legend((folds,), "det J: volume in base space for volume here", scale, ticks)
+    ticks = tuple((value, f"{value:g}") for value in np.linspace(0, scale.high, 5).tolist())
+    return Legend((("Every motion goes down", None),), "Lyapunov value, square cm per second", scale, ticks)
 
 
 def painted(picture: ColourPicture) -> NDArray[np.uint8]:
@@ -142,6 +170,8 @@ def _rounded_up(value: float) -> float:
 
 class OccupancySlice(Picture):
     """The learned occupancy as colour on the slice, the more opaque the more likely."""
+
+    legend = OCCUPANCY
 
     def __init__(self, scene: viser.SceneApi) -> None:
         super().__init__(scene.add_frame("/occupancy", show_axes=False))

@@ -12,6 +12,7 @@ import viser
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.scene import palette
+from dt_viz.ui.scene.legend import Legend
 from dt_viz.ui.scene.palette import Colour
 from dt_viz.ui.tabs.plots import small
 
@@ -82,13 +83,7 @@ def add_about(
 
 def legend_html() -> str:
     """Return the legend of what is drawn in the scene."""
-    mark = "display:inline-block;width:0.9em;height:0.9em;border-radius:50%;vertical-align:-0.1em;margin-right:0.5em;"
-    return small(
-        "".join(
-            f"<div><span style='{mark}background:{palette.css(colour)}'></span>{html.escape(text)}</div>"
-            for text, colour in LEGEND.items()
-        )
-    )
+    return small(Legend(tuple(LEGEND.items())).html)
 
 
 def keys_html(commands: Sequence[Command]) -> str:

@@ -12,7 +12,8 @@ from dt_viz.scenario.stack import side_by_side
 from dt_viz.session.frame import Frame
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import KEEP, Bindings
-from dt_viz.ui.scene.legend import OCCUPANCY, Legend, legend_in
+from dt_viz.ui.scene.legend import Legend
+from dt_viz.ui.scene.slice_layers import OCCUPANCY, legend_in
 from dt_viz.ui.tabs.plots import Plots, small
 from dt_viz.ui.tabs.timeline import Timeline
 
@@ -41,7 +42,6 @@ class ShowTab:
     def __init__(self, gui: viser.GuiApi, bindings: Bindings, send: Callable[[str, bytes], None]) -> None:
         """Build the controls where the panel is being built; `send` gets the end of a file's name, and its content."""
         self._bindings = bindings
-        self.legend: Legend | None = None  # legend of the colours that are shown on the slice
         self._add_slice(gui, bindings)
         self.plots = Plots(gui, bindings, send)  # high up in the tab, to be seen when it opens
         self.timeline = Timeline(gui, bindings, self.plots)
@@ -82,7 +82,6 @@ class ShowTab:
         return KEEP if frame is None else legend_in(frame, colour) or KEEP
 
     def _explain(self, legend: Legend | None) -> None:
-        self.legend = legend
         self.key.content, self.key.visible = legend.html if legend else "", legend is not None
 
 

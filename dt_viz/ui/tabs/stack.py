@@ -37,6 +37,7 @@ from dt_viz.session.frame import Frame
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import Bindings, Control
 from dt_viz.ui.scene import palette
+from dt_viz.ui.scene.legend import Legend
 from dt_viz.ui.scene.palette import Colour
 from dt_viz.ui.scene.rollouts import manifold
 from dt_viz.ui.tabs.plots import small
@@ -127,12 +128,9 @@ def legend_html(scenario: Scenario) -> str:
     """Return a legend of the selected level's lines; empty if none is selected."""
     if scenario.view.level not in levels(scenario):
         return ""
-    colour = palette.css(palette.LIGHT.level)
-    swatch = f"display:inline-block;width:1.6em;height:0.28em;vertical-align:middle;background:{colour}"
-    return small(
-        f"<span style='{swatch}'></span> {html.escape(manifold(scenario))}, without what is stacked on it: rollouts, "
-        "and all that lies on the slice. Pale: rollouts of the whole stack"
-    )
+    shown = "without what is stacked on it: rollouts, and all that lies on the slice"
+    text = f"{manifold(scenario)}, {shown}. Pale: rollouts of the whole stack"
+    return small(Legend(((text, palette.LIGHT.level),)).html)
 
 
 def formula_html(scenario: Scenario) -> str:
