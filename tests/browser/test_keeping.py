@@ -24,8 +24,8 @@ from dt_viz.scenario.saved import Known, decode
 from dt_viz.scenario.slices import BASE_PANEL
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui import keeping
+from dt_viz.ui.page import initial
 from dt_viz.ui.panel import HISTORY
-from dt_viz.ui.visitor import initial
 
 pytestmark = [pytest.mark.browser, needs_chromium]
 
@@ -71,7 +71,7 @@ def test_after_a_reload_the_visitor_finds_what_he_has_made(visit, server):
     open_tab(page, "World")
     add(page, "Cylinder")
     wait_until(lambda: len(visitor.session.scenario.obstacles) == 2, "the cylinder")
-    visitor._camera.view("Top")
+    visitor.camera.view("Top")
     wait_until(lambda: kept(page) == visitor.session.scenario, "the browser to keep it")
     until_drawn(visitor)
     seen = visitor.client.camera.position, visitor.client.camera.look_at
@@ -105,7 +105,7 @@ def test_undo_brings_back_what_reset_took_also_the_view_and_the_camera(visit, se
     session.edit("test", view=replace(session.scenario.view, grid=True, panels=(BASE_PANEL,)))
     assert session.wait_idle(PATIENCE)
     until_drawn(visitor)
-    camera, before = visitor._camera, session.scenario
+    camera, before = visitor.camera, session.scenario
     camera.view("Top")
     until_drawn(visitor)
     pose = camera.chosen

@@ -46,7 +46,7 @@ def test_keys_of_the_tour_lead_through_all_steps_and_back_to_what_was_there(brow
         text.wait_for()
         box = page.get_by_role("note").evaluate(BOX)
         assert np.abs(np.subtract(box["whole"], box["seen"])).max() < 1 and not box["spills"]
-        assert tour.number == k and visitor._camera.chosen is None  # these keys do not turn the view meanwhile
+        assert tour.number == k and visitor.camera.chosen is None  # these keys do not turn the view meanwhile
     page.keyboard.press("ArrowRight")  # there is no seventh
     page.keyboard.press("ArrowLeft")
     page.get_by_text(f"{len(STEPS) - 1} of {len(STEPS)}").wait_for()
@@ -138,7 +138,7 @@ FEW = FilmSettings(rate=1, motion=2.0, turn=3.0, rest=0.0, patience=PATIENCE)
 
 def test_a_motion_and_a_turn_are_rendered_and_downloaded(browser, server, initial, monkeypatch, tmp_path):
     monkeypatch.setitem(RESOLUTIONS, "1280 × 720", SIZE)
-    for module in ("visitor", "scene.export"):
+    for module in ("page", "scene.export"):
         monkeypatch.setattr(f"dt_viz.ui.{module}.SETTINGS", FEW)
     page, visitor = open_page(browser, server, (640, 480))
     begin(visitor, replace(initial("draw_s"), view=replace(LIGHT, handles=False, rollouts=True, arm=True)))

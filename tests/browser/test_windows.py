@@ -182,7 +182,7 @@ def test_a_touch_drags_the_sphere(visit):
 
     for _ in range(TRIES):  # a page drawn by software may not show the sphere in its place yet
         begin(visitor, grabbed)
-        visitor._camera.view()
+        visitor.camera.view()
         wait_until(lambda: np.abs(camera.position - home).max() < 1e-3, "the camera to be back")
         until_drawn(visitor)
         begun = np.array(project(page, visitor, before.position))

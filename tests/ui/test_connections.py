@@ -630,10 +630,10 @@ async def test_a_page_reports_its_link_and_the_width_of_its_window_and_nothing_e
                 await client.set("Window", text)
         await client.set("Warp", 0.5)
         assert await client.wait_for(lambda: visitor.session.scenario.warp == 0.5, PATIENCE)
-        assert visitor._camera._width is None and visitor.session.scenario.task == "draw_s"
+        assert visitor.camera._width is None and visitor.session.scenario.task == "draw_s"
         await client.report(width=390, link={"kind": "task", "name": "draw_j"})
         assert await client.wait_for(lambda: visitor.session.scenario.task == "draw_j", PATIENCE)
-        assert visitor._camera._width == 390
+        assert visitor.camera._width == 390
 
 
 def answer(server, request):

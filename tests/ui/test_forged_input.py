@@ -262,7 +262,7 @@ def test_a_ray_that_is_none_adds_no_start(page, ray):
 
 
 def test_reset_and_commands_bring_the_camera_back(page):
-    task, camera = TASKS["draw_s"](), page.visitor._camera
+    task, camera = TASKS["draw_s"](), page.visitor.camera
     page.busy()
     page.session.edit("warp", warp=0.5)
     camera.look(task)
@@ -319,7 +319,7 @@ def test_a_switch_of_the_camera_and_its_command_are_one(page, command, label, na
         (lambda: page.claim(switch, False), False),
     ):
         act()
-        assert (getattr(page.visitor._camera, name), switch.value) == (on, on)
+        assert (getattr(page.visitor.camera, name), switch.value) == (on, on)
 
 
 def test_a_command_that_is_forged_or_disabled_is_not_given(page):
@@ -344,7 +344,7 @@ def test_the_presentation_goes_from_scene_to_scene_and_folds_no_panel(page, monk
         return page.session.scenario.scene
 
     def is_on():
-        (on,) = {presentation.on, buttons.visible, page.visitor._camera.framing.alone}
+        (on,) = {presentation.on, buttons.visible, page.visitor.camera.framing.alone}
         return on
 
     (buttons,) = (handle for handle in page.inputs if handle.label == "Presentation" and hasattr(handle, "options"))

@@ -27,10 +27,10 @@ from dt_viz.session.session import CHOICES
 from dt_viz.session.teaching import Stroke, board_of
 from dt_viz.ui import keeping, panel
 from dt_viz.ui.keeping import KEY, LANE, PAUSE, PLACES
+from dt_viz.ui.page import initial
 from dt_viz.ui.scene.camera import view_of
 from dt_viz.ui.scripts import Link, Window
 from dt_viz.ui.tabs.status import verdict
-from dt_viz.ui.visitor import initial
 
 PLACE = (0.1, -0.5, 0.4)
 KNOWN = Known((*TITLES, *PLACES), None)
@@ -103,8 +103,8 @@ def settled(page: Page) -> None:
 
 def look_from_the_top(page: Page) -> None:
     """Move the camera, as its first report may do, too."""
-    page.visitor._camera.look(TASKS["draw_s"]())
-    page.visitor._camera.view("Top")
+    page.visitor.camera.look(TASKS["draw_s"]())
+    page.visitor.camera.view("Top")
 
 
 def kept(browser: Browser) -> Saved:
@@ -616,7 +616,7 @@ def test_one_task_too_many_is_refused_and_none_is_lost(opened_for):
     for k in range(MOST_OWN):
         page.session.bring(own(shift=(0.01 * k, 0.0, 0.0)))
     page.settle()
-    page.visitor._panel.resume(page.session, own_of("draw_c"), lambda _saved: None)
+    page.visitor.resume(own_of("draw_c"))
     page.settle()
     again = opened_for(Slow(**page.client.local_storage))
     again.session.bring(own("draw_j"))
@@ -795,7 +795,7 @@ def test_a_link_opens_a_scenario_that_the_server_offers_by_its_name(opened_for):
 def drawn(page: Page, scenario: Scenario, stage: Stage) -> None:
     """What the page does with the camera for a frame."""
     frame = frame_of(scenario, stage=stage, task=TASKS[scenario.task]())
-    camera, keeper = page.visitor._camera, page.visitor._keeper
+    camera, keeper = page.visitor.camera, page.visitor._keeper
     camera.look(frame.task)
     if (sight := keeper.sight(frame)) is not None:
         camera.choose((np.array(sight[0]), np.array(sight[1])))
@@ -805,17 +805,17 @@ def drawn(page: Page, scenario: Scenario, stage: Stage) -> None:
 def test_a_camera_that_is_moved_is_kept_and_one_that_is_not_is_none(opened_for):
     browser = Browser()
     page = opened_for(browser)
-    page.visitor._camera.look(TASKS["draw_s"]())
+    page.visitor.camera.look(TASKS["draw_s"]())
     page.session.edit("Warp", warp=0.5)
     settled(page)
     assert kept(browser).camera is None
-    page.visitor._camera.view("Top")
+    page.visitor.camera.view("Top")
     settled(page)
-    top = view_of(TASKS["draw_s"](), page.visitor._camera.framing, "Top")
+    top = view_of(TASKS["draw_s"](), page.visitor.camera.framing, "Top")
     camera = kept(browser).camera
     assert camera is not None
     np.testing.assert_allclose(camera, top)
-    page.visitor._camera.view("Home")
+    page.visitor.camera.view("Home")
     settled(page)
     assert kept(browser).camera is None
 

@@ -53,7 +53,7 @@ def test_joints_scenes_plots_and_the_loop_are_those_of_the_arm(page):
     assert not OF_JACO & set(page["Scene"].options) and set(page["Scene"].options) < set(scenes)
     plots = visitor._panel.show.plots.joints[0]
     assert len(plots.speeds.series) == len(plots.speeds.data) == 1 + 7 + 1
-    assert visitor._camera.framing.arm_size == robot.size
+    assert visitor.camera.framing.arm_size == robot.size
     visitor.robot.arms.pose(robot.home, robot.home)
     visitor.adopt(page.session.scenario)
     page.session.undo()

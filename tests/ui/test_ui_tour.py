@@ -106,7 +106,7 @@ def test_the_end_gives_back_all_as_it_was_to_the_byte_and_its_history(opened):
 
 def test_the_camera_is_where_it_was(opened):
     page = opened()
-    camera = page.visitor._camera
+    camera = page.visitor.camera
     camera.look(page.session.task)
     camera.view("Top")
     page.settle()

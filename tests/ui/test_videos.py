@@ -53,7 +53,7 @@ def frame(at_rest, initial):
 @pytest.fixture
 def filming(server, robot, frame, engine, monkeypatch, tmp_path):
     """A page that shows a motion, held at a moment of it, and what renders it."""
-    for module in ("visitor", "scene.export"):
+    for module in ("page", "scene.export"):
         monkeypatch.setattr(f"dt_viz.ui.{module}.SETTINGS", SHORT)
     fine = lambda _self, scenario, cancelled: engine.fine(scenario, cancelled)  # noqa: E731
     monkeypatch.setattr(NoFrames, "fine", fine, raising=False)
@@ -145,7 +145,7 @@ def test_a_turntable_goes_around_the_middle_once(filming):
     before = state(filming)
     _, frames = decoded(save(filming, TURNTABLE))
     assert len(frames) == len(filming.browser.shots) == 10
-    camera = filming.visitor._camera
+    camera = filming.visitor.camera
     first = camera.shot(SIZE)
     middle = first.position + camera.depth * rotation(tuple(first.wxyz))[:, 2]
     np.testing.assert_allclose(filming.browser.shots[0][1], first.position, atol=1e-9)
@@ -217,10 +217,10 @@ def test_an_edit_ends_it_and_is_shown(filming, frame):
 def test_what_moves_waits_and_the_theme_that_is_chosen_comes_afterwards(filming, monkeypatch):
     visitor, browser = filming.visitor, filming.browser
     visitor.robot.playback.replay.play()
-    visitor._camera.orbits = True
-    visitor._camera._shown = visitor.shown.task, (), "Home"
-    visitor._camera._given.append((np.array(filming.camera.position), np.array(filming.camera.look_at)))
-    wait_until(lambda: visitor._camera._turned is not None)
+    visitor.camera.orbits = True
+    visitor.camera._shown = visitor.shown.task, (), "Home"
+    visitor.camera._given.append((np.array(filming.camera.position), np.array(filming.camera.look_at)))
+    wait_until(lambda: visitor.camera._turned is not None)
     browser.goes_on.clear()
     begin(filming, TURNTABLE)
     assert browser.waits.wait(30)
@@ -236,7 +236,7 @@ def test_what_moves_waits_and_the_theme_that_is_chosen_comes_afterwards(filming,
     turned = np.linalg.norm(filming.camera.position - place) / np.linalg.norm(place - filming.camera.look_at)
     assert turned < 0.5 * TURN  # it goes on from where it was
     assert visitor.pictures._theme is DARK
-    visitor._camera.orbits = False
+    visitor.camera.orbits = False
     filming.claim(filming["Dark theme"], False)
     filming.done()
 
@@ -255,7 +255,7 @@ WRONG = {
 def test_what_goes_wrong_is_said_in_a_line_and_nothing_stays(filming, frame, why, monkeypatch, tmp_path):
     browser, before = filming.browser, state(filming)
     if why == "no answer":
-        for module in ("visitor", "scene.export"):
+        for module in ("page", "scene.export"):
             monkeypatch.setattr(f"dt_viz.ui.{module}.SETTINGS", replace(SHORT, patience=0.3))
         browser.goes_on.clear()
     elif why == "another size":

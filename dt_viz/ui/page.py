@@ -1,4 +1,15 @@
-"""The page of one visitor: a private scene, panel and session, tied together."""
+"""The page of one visitor: a private scene, panel and session, tied together.
+
+The trip of a drag, from the browser and back:
+
+1. `scene.draggables` takes the new place on the server's event loop, checked, and calls `Session.edit`.
+2. `Session.edit` puts it into the frozen scenario and submits that; the newest replaces what waits.
+3. A thread of the session's jobs waits for its slot of `scheduler`, and iterates over `Engine.frames`.
+4. `motion.solve` stacks the transforms on what was learned, and computes the rollouts; the arm follows one of them.
+5. `Page.draw` gives the frame to `ScenePictures` and `RobotScene`, which change what differs in viser's scene.
+6. `Page.adopt` shows the scenario on the controls, and `ControlPanel.report` the figures of the frame.
+7. The field, finer rollouts and certificates come as frames of later stages, unless a newer edit waits.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +48,6 @@ from dt_viz.session.session import Session
 from dt_viz.ui.bindings import EDITS
 from dt_viz.ui.keeping import Keeper
 from dt_viz.ui.panel import ControlPanel
-from dt_viz.ui.pen import Pen
 from dt_viz.ui.playback import Playback, Replay
 from dt_viz.ui.scene.camera import CameraController, Framing, Pose, Shot, shot_beside, shot_of, turned_shot, view_of
 from dt_viz.ui.scene.export import (
@@ -103,8 +113,8 @@ def notify(client: viser.ClientHandle, text: str, colour: Colour, seconds: float
     client.add_notification("DT-Viz", text, color=colour, auto_close_seconds=seconds)
 
 
-class Visitor(Display):
-    """Shows a session in the browser of one visitor."""
+class Page(Display):
+    """A visitor's scene, panel and session; what controls use of it is `host.Host`."""
 
     def __init__(
         self,
@@ -140,32 +150,14 @@ class Visitor(Display):
             self.pictures = ScenePictures(client.scene, robot, lambda: self.session)
             self.robot = RobotScene(client, robot, Playback(engine.arm, self._pose))
             self._studio = Studio(self.pictures, lambda: self.robot, self._changing)
-            pen = Pen(self.pictures, lambda: self.robot, lambda: self.session, self._face)
-            self._camera = CameraController(client, lambda: self.robot.hand, robot.size, self._keeper.changed)
-            self._panel = ControlPanel(
-                client.gui,
-                titles,
-                robot,
-                titled,
-                self.picture,
-                self._send,
-                partial(notify, client, seconds=BRIEF),
-                self._camera,
-                self._darken,
-                partial(self._preview, pen),
-                self._save,
-                self._open,
-                pen,
-                client.local_storage,
-                self._came_back,
-                {name: partial(self._resume, saved) for name, saved in scenarios.items()},
-            )
+            self.camera = CameraController(client, lambda: self.robot.hand, robot.size, self._keeper.changed)
+            self._panel = ControlPanel(self, titles, titled, robot, scenarios)
         begun = self._keeper.begun
         at_once = None if begun is None or _takes_long(begun) else begun.scenario
         begins_like = lambda engine, name: initial(engine.task(name))  # noqa: E731
         self.session = Session(engine, begins_like, task, self, arms and arms.engine, at_once)
         self._panel.connect(self.session)
-        self._keeper.begin(self.session, self._resume)
+        self._keeper.begin(self.session, self.resume)
         self._panel.tour.begin(self.session)
         self.robot.playback.begin(self.session.jobs, self.session.fail)
 
@@ -175,7 +167,7 @@ class Visitor(Display):
 
     def reported(self, window: Window) -> None:
         """Frame the scene for the window's width, and open what the page's link asks for."""
-        self._camera.measured(window.width)
+        self.camera.measured(window.width)
         if window.link is not None:
             self._panel.follow(self.session, window.link)
 
@@ -187,7 +179,7 @@ class Visitor(Display):
     @property
     def seen(self) -> tuple[Pose, Framing] | None:
         """Where the camera is, as the browser told, and the window; None where that is nowhere."""
-        return self._camera.seen
+        return self.camera.seen
 
     def draw(self, frame: Frame, pace: Pace) -> None:
         with self._studio.drawing:  # a video ends before what was edited meanwhile is drawn
@@ -202,13 +194,13 @@ class Visitor(Display):
         if frame.scenario.arm != (self.shown.scenario.arm if self.shown else ""):
             self._exchange(frame.scenario.arm)
         settled = frame.stage is not Stage.ROLLOUTS and self._previews is False
-        others = settled and len(beside) != len(self._camera.panels)
+        others = settled and len(beside) != len(self.camera.panels)
         if self.shown is not None and frame.task is not self.shown.task:
             self.robot.playback.resume()
         if self.shown is None or frame.task is not self.shown.task or others:
-            self._camera.look(frame.task, beside)
+            self.camera.look(frame.task, beside)
         if (pose := pose_of(self._keeper.sight(frame))) is not None:
-            self._camera.choose(pose)
+            self.camera.choose(pose)
             self._keeper.changed()
         with self.client.atomic():
             self.pictures.draw(frame)
@@ -237,43 +229,40 @@ class Visitor(Display):
 
     def _made(self, tasks: Collection[str]) -> Saved:
         """What the visitor has made, beside the tour, with the task unless it is one of these."""
-        pose = self._panel.tour.pose if self.session.visits else self._camera.chosen
+        pose = self._panel.tour.pose if self.session.visits else self.camera.chosen
         scenario, lesson = self.session.own, self._panel.opening.lesson
         task = self.session.engines(scenario.arm).task(scenario.task)
         own = None if scenario.task in tasks else Own.of(task)
         return Saved(scenario, _sight(pose), own, None if task.lesson == lesson else lesson)
 
-    def _came_back(self, pose: Pose | None) -> None:
-        """Have the camera where it was before the tour or Reset, with the visitor's own scenario."""
+    def came_back(self, pose: Pose | None) -> None:
         self._keeper.go_on(Saved(self.session.own, _sight(pose)))
 
-    def _resume(self, saved: Saved) -> None:
-        self._panel.resume(self.session, saved, self._keeper.go_on)
+    def resume(self, saved: Saved) -> None:
+        self._panel.resume(saved)
 
-    def _save(self, session: Session) -> None:
-        """Send the scenario as a file, beside the server's event loop, or say why that cannot be."""
+    def began(self, saved: Saved) -> None:
+        self._keeper.go_on(saved)
+
+    def save(self) -> None:
 
         def send() -> None:
             try:
                 content = encode(self._made(TASKS)).encode()
             except DataError as error:
-                session.say(str(error), Severity.ALARM)
+                self.session.say(str(error), Severity.ALARM)
             else:
-                self._send(".json", content)
+                self.send(".json", content)
 
-        session.jobs.submit(EDITS, send)
+        self.session.jobs.submit(EDITS, send)
 
-    def _open(self, name: str, content: bytes) -> bool:
-        """Go on with the scenario that a file holds; return whether it holds one. Raises as `decode`."""
+    def open(self, name: str, content: bytes) -> bool:
         if not is_saved(content):
             return False
-        self._resume(self._keeper.read(content, name))
+        self.resume(self._keeper.read(content, name))
         return True
 
-    def _preview(self, pen: Pen, seen: Preview | None, number: int | None) -> None:
-        """Show takes that are not learned yet in place of the motion; see `ui.tabs.opening.Show`."""
-        if seen is None:
-            pen.put_down()
+    def preview(self, seen: Preview | None, number: int | None) -> None:
         if number is None:
             self._previews = None
         elif seen is None:
@@ -284,7 +273,7 @@ class Visitor(Display):
                 self.pictures.preview(seen, number)
                 self.robot.set_aside(True)
             if seen.task is not None and not before:
-                self._camera.look(seen.task)
+                self.camera.look(seen.task)
             self.client.flush()
         self._keeper.changed()
 
@@ -294,17 +283,16 @@ class Visitor(Display):
             self.pictures.preview(None, 0)
             self.robot.set_aside(False)
         if self.shown is not None:
-            self._camera.look(self.shown.task, tuple(panel.shown for panel in self.shown.pictures.panels))
+            self.camera.look(self.shown.task, tuple(panel.shown for panel in self.shown.pictures.panels))
         self.client.flush()
 
-    def _face(self, board: Slice | None) -> None:
-        """Move the camera straight before a board, or to where all is seen."""
+    def face(self, board: Slice | None) -> None:
         if self.shown is not None:
-            self._camera.look(self.shown.task, () if board is None else (board,))
+            self.camera.look(self.shown.task, () if board is None else (board,))
 
     def _pose(self) -> None:
         now = time.monotonic()
-        self._camera.turn(now)
+        self.camera.turn(now)
         with self._exchanging:
             if self.robot.playback.film is None:
                 self.robot.pose(now, self.pictures.look.tubes)
@@ -324,7 +312,7 @@ class Visitor(Display):
             self.robot.set_aside(self._previews is not False)
             self._panel.take(robot)
         self.robot.playback.begin(self.session.jobs, self.session.fail)  # and the one before ends
-        self._camera.reframe(arm_size=robot.size)
+        self.camera.reframe(arm_size=robot.size)
 
     @contextmanager
     def _changing(self) -> Iterator[None]:
@@ -337,8 +325,7 @@ class Visitor(Display):
             dark_mode=theme is DARK, show_logo=False, show_share_button=False, brand_color=LIGHT.brand
         )
 
-    def _darken(self, dark: bool) -> None:
-        """Begin the dark theme, or the light one, on the panel and in the scene."""
+    def darken(self, dark: bool) -> None:
         self._studio.theme = DARK if dark else LIGHT
         self._dress(self._studio.theme)
         self._studio.paint()
@@ -363,12 +350,12 @@ class Visitor(Display):
         frame = self._something
         follower = self.session.engines(frame.scenario.arm).follower
         with self.session.engine.refining(cancelled):
-            return drawn(frame, order.suffix, follower, self._camera.chosen, step)
+            return drawn(frame, order.suffix, follower, self.camera.chosen, step)
 
     def _shot(self, order: Order) -> tuple[Shot, float]:
         """Return the camera of a picture, and the distance of what it looks at, metres."""
         if not order.alone:
-            return self._camera.shot(order.size), self._camera.depth
+            return self.camera.shot(order.size), self.camera.depth
         if (pose := pose_of(order.sight)) is None:
             frame, whole = self._something, Framing(order.size, panel=0.0, narrow=0)
             shot = shot_of(pose := view_of(frame.task, whole, panels=[panel.shown for panel in frame.pictures.panels]))
@@ -435,7 +422,7 @@ class Visitor(Display):
             with self._changing():
                 playback.film = None
                 self.robot.adopt(self.session.scenario.view, self.pictures.look)
-            self._camera.rest()
+            self.camera.rest()
             self.client.flush()
 
     @property
@@ -450,6 +437,9 @@ class Visitor(Display):
             raise FormatError("the scene", "nothing yet", "a scene that is shown")
         return self.shown
 
-    def _send(self, suffix: str, content: bytes) -> None:
+    def notify(self, text: str, colour: Colour) -> None:
+        notify(self.client, text, colour, seconds=BRIEF)
+
+    def send(self, suffix: str, content: bytes) -> None:
         name = "-".join(filter(None, ("dt-viz", self.session.scenario.task, self.session.scenario.arm)))
         self.client.send_file_download(f"{name}{suffix}", content, save_immediately=True)
