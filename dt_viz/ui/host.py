@@ -36,6 +36,7 @@ class Host(Protocol):
 
     def picture(self, order: Order, step: Step, cancelled: Cancelled) -> bytes:
         """Return what is shown as the content of a file; raises as `page.Page.picture`."""
+        ...
 
     def darken(self, dark: bool) -> None:
         """Begin the dark theme, or the light one, on the panel and in the scene."""
@@ -54,6 +55,7 @@ class Host(Protocol):
 
     def open(self, name: str, content: bytes) -> bool:
         """Go on with the scenario that a file holds; return whether it holds one. Raises as `saved.decode`."""
+        ...
 
     def resume(self, saved: Saved) -> None:
         """Go on with what was saved, beside the server's event loop."""
