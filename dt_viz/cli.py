@@ -154,7 +154,7 @@ def _offered(options: argparse.Namespace, robot: Robot) -> _Offered:
     from dt_viz.learning.store import FitStore  # noqa: PLC0415
     from dt_viz.scenario.tasks import OWN, TaskEntry, known_tasks  # noqa: PLC0415
     from dt_viz.session.arms import ArmStore  # noqa: PLC0415
-    from dt_viz.ui.visitor import known_names  # noqa: PLC0415
+    from dt_viz.ui.page import known_names  # noqa: PLC0415
 
     tasks, own = known_tasks(options.lasa), None
     known = known_names(tasks, ArmStore(tasks, FitStore(None), robot).titles)

@@ -32,11 +32,11 @@ from dt_viz.scenario.tour import STEPS, TASK
 from dt_viz.session.arms import ArmStore
 from dt_viz.session.frame import Stage
 from dt_viz.session.session import CHOICES
+from dt_viz.ui.page import initial, known_names, pose_of
 from dt_viz.ui.scene.export import FORMATS, SETTINGS, Order
 from dt_viz.ui.scene.figure import SUFFIXES
 from dt_viz.ui.scene.recording import drawn
 from dt_viz.ui.server import Server
-from dt_viz.ui.visitor import initial, known_names, pose_of
 
 BAD_INPUT = 2  # exit status for what the user can put right; argparse uses the same
 BROWSERS = "chromium", "chromium-browser", "google-chrome", "google-chrome-stable"

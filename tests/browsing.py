@@ -8,7 +8,7 @@ import pytest
 from pages import all_of
 
 from dt_viz.scenario.scenario import Scenario, View
-from dt_viz.ui.visitor import Visitor
+from dt_viz.ui.page import Page
 
 PATIENCE = 240.0
 """Seconds after which a test gives up; nothing takes that long, even on a machine that has other work."""
@@ -122,7 +122,7 @@ def close_page(page, server, visitor):
     wait_until(lambda: visitor not in server.visitors, "the visitor to leave")
 
 
-def begin(visitor: Visitor, scenario: Scenario) -> None:
+def begin(visitor: Page, scenario: Scenario) -> None:
     """Begin with a scenario, and wait until it is shown."""
     visitor.session.edit("test", **all_of(scenario))
     visitor.session.end_gesture()
@@ -130,7 +130,7 @@ def begin(visitor: Visitor, scenario: Scenario) -> None:
     assert visitor.shown is not None and visitor.shown.scenario.choices == scenario.choices
 
 
-def project(page, visitor: Visitor, point) -> tuple[float, float]:
+def project(page, visitor: Page, point) -> tuple[float, float]:
     """CSS pixels of a world point: the camera looks along its z axis, y down, vertical field of view.
 
     The window's size is the browser's own: viser's page tells that of its picture, which is smaller while it is slow.

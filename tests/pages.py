@@ -8,6 +8,7 @@ import time
 from dataclasses import fields, make_dataclass, replace
 from types import MappingProxyType, SimpleNamespace
 from typing import Any, cast
+from unittest.mock import MagicMock
 
 import numpy as np
 import viser  # noqa: TID251 - a page that no browser shows
@@ -30,11 +31,11 @@ from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.robot_loop import LiveArm
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import EDITS, Bindings, Control
+from dt_viz.ui.page import Page as VisitorPage
 from dt_viz.ui.panel import ControlPanel
 from dt_viz.ui.playback import LANE as ARM
 from dt_viz.ui.scene.camera import HOME, CameraController, Framing, view_of, window_size
 from dt_viz.ui.tabs.opening import CHOOSING
-from dt_viz.ui.visitor import Visitor
 from dt_viz.warning import Severity
 
 MIDDLE = (0.1, -0.5, 0.4)
@@ -129,9 +130,11 @@ def camera_for(task: Any, camera: Any, view: str = HOME, hand: Any = None, **fra
 
 
 def panel_of(server: viser.ViserServer, notify: Any = ignored) -> ControlPanel:
-    """A panel without a page."""
-    camera = CameraController(cast(Any, CameraClient()), lambda: None)
-    return ControlPanel(server.gui, TITLES, load_jaco(), {"": "JACO"}, ignored, ignored, notify, camera, ignored)
+    """The panel of a page that shows nothing else."""
+    page = cast(Any, MagicMock())
+    page.client.gui, page.notify = server.gui, notify
+    page.camera = CameraController(cast(Any, CameraClient()), lambda: None)
+    return ControlPanel(page, TITLES, {"": "JACO"}, load_jaco())
 
 
 class Kept(dict):
@@ -223,7 +226,7 @@ class Page:
         self.gui._resolve_client = lambda _id: self.client  # type: ignore[method-assign]
         self.scene._get_client_handle = lambda _id: self.client  # type: ignore[method-assign]
         engine = cast(Engine, NoFrames())
-        self.visitor = Visitor(cast(Any, self.client), engine, robot, TITLES, "draw_s", arms, **offered)
+        self.visitor = VisitorPage(cast(Any, self.client), engine, robot, TITLES, "draw_s", arms, **offered)
         self._loop = asyncio.new_event_loop()
         self.session = self.visitor.session
         self._initial = self.session.scenario

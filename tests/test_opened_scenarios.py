@@ -15,7 +15,7 @@ from dt_viz.scenario.own import Own
 from dt_viz.scenario.saved import Saved, encode
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import TASKS, own_task
-from dt_viz.ui.visitor import initial
+from dt_viz.ui.page import initial
 
 BALL = dt.Sphere((0.05, -0.5, 0.40), 0.10)
 AROUND = changed(

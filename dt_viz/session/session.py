@@ -437,6 +437,7 @@ class Session:
                 self._adopt()
             raise
         finally:
+            self._catch_up()
             if self._screen.progress.learning is not None:
                 self._screen.tell(learning=None)
 
@@ -459,7 +460,6 @@ class Session:
         return replace(scenario, passing=passing)
 
     def _show_frames(self, scenario: Scenario, edited: float, superseded: Callable[[], bool]) -> None:
-        self._catch_up()
         learn = partial(self._learn, scenario)
         engine, begun, pause = self.engines(scenario.arm, learn), edited, 0.0
 
@@ -487,6 +487,7 @@ class Session:
                 pause = self._screen.live_pause(time.perf_counter() - begun)
 
         for frame in engine.frames(scenario, learn, superseded, newest, draw=draw):
+            self._catch_up()
             if frame.stage is Stage.ROLLOUTS and pause <= 0:
                 continue  # the field is due, whatever is waiting
             if frame.stage > Stage.LIVE:

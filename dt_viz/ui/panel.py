@@ -11,7 +11,6 @@ from typing import Any
 import viser
 
 from dt_viz.avoidance.avoidance import Space
-from dt_viz.errors import Cancelled
 from dt_viz.robot.placement import is_jaco
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.paper_scenes import SCENES, PaperScene, found, offered
@@ -25,18 +24,13 @@ from dt_viz.session.progress import Progress
 from dt_viz.session.session import CHOICES, Session
 from dt_viz.ui import patches
 from dt_viz.ui.bindings import Bindings, Control
-from dt_viz.ui.gate import MAX_UPLOAD
-from dt_viz.ui.keeping import Storage
-from dt_viz.ui.pen import Pen
-from dt_viz.ui.scene.camera import CameraController, Pose
-from dt_viz.ui.scene.export import Order
-from dt_viz.ui.scene.figure import Step
-from dt_viz.ui.scene.palette import Colour
+from dt_viz.ui.host import Host
+from dt_viz.ui.scene.camera import Pose
 from dt_viz.ui.scripts import Link
 from dt_viz.ui.tabs.about import Command, add_about, add_commands, numbered
 from dt_viz.ui.tabs.arm import add_arm, add_joints
 from dt_viz.ui.tabs.compare import ComparePanel
-from dt_viz.ui.tabs.opening import OpenPanel, Show, TeachPanel
+from dt_viz.ui.tabs.opening import OpenPanel, TeachPanel
 from dt_viz.ui.tabs.picture import PictureTab, Presentation, big_type
 from dt_viz.ui.tabs.show import ShowTab
 from dt_viz.ui.tabs.stack import StackPanel
@@ -65,48 +59,36 @@ class ControlPanel:
 
     def __init__(
         self,
-        gui: viser.GuiApi,
+        page: Host,
         titles: Mapping[str, str],
-        robot: Robot,
         arms: Mapping[str, str],
-        draw: Callable[[Order, Step, Cancelled], bytes],
-        send: Callable[[str, bytes], None],
-        notify: Callable[[str, Colour], None],
-        tripod: CameraController,
-        darken: Callable[[bool], None],
-        preview: Show = lambda _seen, _number: None,
-        save: Callable[[Session], None] = lambda _session: None,
-        open_scenario: Callable[[str, bytes], bool] = lambda _name, _content: False,
-        pen: Pen | None = None,
-        storage: Storage | None = None,
-        came_back: Callable[[Pose | None], None] = lambda _pose: None,
-        scenarios: Mapping[str, Callable[[], None]] = MappingProxyType({}),
+        robot: Robot,
+        scenarios: Mapping[str, Saved] = MappingProxyType({}),
     ) -> None:
-        """Build the controls, for the titles of tasks and arms by name; they act once `connect` has given a session.
+        """Build the controls of a page; they act once `connect` has given a session.
 
-        `draw` makes a picture or a video; `send` sends a file whose name ends like this, with a content. `save`
-        sends the scenario as a file and must only submit. `open_scenario` goes on with the scenario of a file
-        if it holds one. A visitor teaches with the `pen`. The browser's `storage` keeps where the visitor is in
-        the tour. `came_back` takes the camera to a pose at the end of the tour, see `Tour`, and where Reset is
-        undone. A link may name one of the `scenarios`, which begin when they are called.
+        Args:
+            page: what the controls act on.
+            titles: of the tasks, by name.
+            arms: titles of the arms, by name.
+            robot: the first arm.
+            scenarios: those that a link may name.
         """
-        self._notify, self._titles, self._scenarios = notify, lambda: titles, scenarios
+        gui, self._page, self._titles, self._scenarios = page.client.gui, page, lambda: titles, scenarios
         self._scenes = {scene.title: scene for scene in offered(titles)}
         self.bindings = bindings = Bindings()
-        self.presentation = Presentation(gui, self._turn, lambda alone: tripod.reframe(alone=alone))
+        self.presentation = Presentation(gui, self._turn, lambda alone: page.camera.reframe(alone=alone))
         bindings.show(self._title, lambda title: self.presentation.write(title=title))
-        enlarge = big_type(gui, tripod)
-        self.tour = Tour(gui, bindings, tripod, self.choose, storage, came_back)
-        self.opening, self._scene = self._add_choices(
-            gui, preview, lambda name, content: open_scenario(name, content) or loader.takes(name, content), send
+        enlarge = big_type(gui, page.camera)
+        self.tour = Tour(gui, bindings, page, self.choose)
+        self._scene, self.opening = self._add_choices(
+            gui, lambda name, content: page.open(name, content) or loader.takes(name, content)
         )
-        if pen is not None:
-            TeachPanel(gui, bindings, self.opening, pen)
         self.hint = gui.add_html(hint_html(""))
         add_avoid_and_imitate(gui, bindings)
         self.status = StatusLine(gui, bindings)
-        reset = partial(self._reset, tripod, came_back)
-        travels = {"Undo": Session.undo, "Redo": Session.redo, "Reset": reset, "Save": save}
+        save = lambda _session: page.save()  # noqa: E731
+        travels = {"Undo": Session.undo, "Redo": Session.redo, "Reset": self._reset, "Save": save}
         for button, act in travels.items():
             group = gui.add_button_group("History" if button == "Undo" else button, (button,), hint=HISTORY[button])
             bindings.on(group, lambda session, _pressed, act=act: act(session))
@@ -119,15 +101,15 @@ class ControlPanel:
         with tabs.add_tab("Stack"):
             StackPanel(gui, bindings)
         with tabs.add_tab("Show"):
-            self.show = ShowTab(gui, bindings, send)
+            self.show = ShowTab(gui, bindings, page.send)
         with tabs.add_tab("Arm"):
             add_arm(gui, bindings, arms, self.begin, lambda session: self.show.timeline.show(session, PAST))
-            add_joints(gui, bindings, send)
+            add_joints(gui, bindings, page.send)
         with tabs.add_tab("Compare"):
-            ComparePanel(gui, bindings, send)
+            ComparePanel(gui, bindings, page.send)
         with tabs.add_tab("Picture"):
-            picture = PictureTab(gui, bindings, tripod, self.presentation, darken, enlarge, draw, send)
-        commands = self._commands(gui.main_panel, picture, reset, save)
+            picture = PictureTab(gui, bindings, page, self.presentation, enlarge)
+        commands = self._commands(gui.main_panel, picture, save)
         add_commands(gui, bindings, commands)
         add_about(gui, bindings, commands, self.tour.take)
         self.take(robot)
@@ -171,16 +153,10 @@ class ControlPanel:
         self.presentation.write(caption=text if step is None else step.text)
         message = progress.message
         if message is not None and message is not notified:
-            self._notify(sentence(message.text), COLOURS[message.severity][0])
+            self._page.notify(sentence(message.text), COLOURS[message.severity][0])
 
-    def _add_choices(
-        self,
-        gui: viser.GuiApi,
-        preview: Show,
-        take: Callable[[str, bytes], bool],
-        send: Callable[[str, bytes], None],
-    ) -> tuple[OpenPanel, Control]:
-        """Add the dropdowns of tasks and scenes, and what opens recordings; return that, and the one of the scenes."""
+    def _add_choices(self, gui: viser.GuiApi, take: Callable[[str, bytes], bool]) -> tuple[Control, OpenPanel]:
+        """Add the dropdowns of tasks and scenes, and what opens recordings; return that of the scenes, and this."""
 
         def choose(session: Session, title: str) -> None:
             session.choose_task(next(name for name, other in self._titles().items() if other == title))
@@ -192,12 +168,14 @@ class ControlPanel:
         hint = "out of the list and of this browser; Undo brings it back"
         delete = gui.add_button_group("Own task", (DELETE,), hint=hint, visible=False)
         self.bindings.on(delete, partial(self.begin, self._delete), visible=lambda s: s.task not in shipped)
-        opening = OpenPanel(gui, self.bindings, preview, self._learn, MAX_UPLOAD, take, send)
-        return opening, self.bindings.choice(
+        opening = OpenPanel(gui, self.bindings, self._page, self._learn, take)
+        scenes = self.bindings.choice(
             gui.add_dropdown("Scene", (NO_SCENE, *self._scenes), hint="scenes of the paper's figures"),
             lambda s: SCENES[s.scene].title if s.scene in SCENES else NO_SCENE,
             partial(self.begin, self._load),
         )
+        TeachPanel(gui, self.bindings, opening)
+        return scenes, opening
 
     def _learn(self, session: Session, task: Task) -> None:
         """Begin with a task of the visitor's own: with the present choices, or as a saved motion begins."""
@@ -215,23 +193,20 @@ class ControlPanel:
             session.delete(name, [*titles][[*titles].index(name) - 1])
             session.say(f"“{titles[name]}” is deleted; Undo brings it back.", Severity.NOTE)
 
-    def resume(self, session: Session, saved: Saved, began: Callable[[Saved], None]) -> None:
-        """Go on with what was saved, beside the server's event loop; `began` gets it with its task's name on this page.
-
-        If that fails, say why and stay.
-        """
+    def resume(self, saved: Saved) -> None:
+        """Go on with what was saved, beside the server's event loop. If that fails, say why and stay."""
 
         def begin(session: Session, _title: str) -> None:
             scenario = saved.scenario
             check_shapes(scenario)
             if saved.own is not None:
                 scenario = replace(scenario, task=session.bring(saved.own.task, scenario.arm).name)
-            began(replace(saved, scenario=scenario))
+            self._page.began(replace(saved, scenario=scenario))
             session.restore(scenario)
             if saved.lesson is not None:
                 self.opening.reopen(saved.lesson)
 
-        self.begin(begin, session, "")
+        self.begin(begin, self._page.session, "")
 
     def _title(self, scenario: Scenario) -> str:
         if self.tour.step is not None:
@@ -268,7 +243,7 @@ class ControlPanel:
         elif link.kind == "tour" and link.name in ("", *NUMBERS):
             self.tour.take(session, int(link.name or 1) - 1)
         elif link.kind == "scenario" and link.name in self._scenarios:
-            self._scenarios[link.name]()
+            self._page.resume(self._scenarios[link.name])
         else:
             accepted = ", ".join(names[link.kind])[:200] or "none: this server offers none"
             text = f"The link: {link.kind}: found {link.name!r}; accepted: {accepted}"
@@ -303,7 +278,6 @@ class ControlPanel:
         self,
         panel: Any,  # noqa: ANN401 - viser's, without a name
         picture: PictureTab,
-        reset: Callable[[Session], None],
         save: Callable[[Session], None],
     ) -> list[Command]:
         folded = False  # a visitor may unfold it by hand, which nobody is told of
@@ -322,7 +296,7 @@ class ControlPanel:
 
         return [
             *self.show.timeline.commands,
-            Command("Reset the scene and the camera", reset, "R"),
+            Command("Reset the scene and the camera", self._reset, "R"),
             Command("Undo", Session.undo, "Z"),
             Command("Redo", Session.redo, "Z", shifted=True),
             Command("Save the scenario as a file", save),
@@ -334,18 +308,19 @@ class ControlPanel:
             *numbered(tuple(self._scenes), partial(self.begin, self._load)),
         ]
 
-    def _reset(self, tripod: CameraController, came_back: Callable[[Pose | None], None], session: Session) -> None:
+    def _reset(self, session: Session) -> None:
         """Reset the session and the camera; in the tour, begin the step anew."""
+        camera = self._page.camera
 
         def put_back(pose: Pose | None) -> None:
-            tripod.view()
-            came_back(pose)
+            camera.view()
+            self._page.came_back(pose)
 
         if self.tour.step is not None:
             self.tour.turn(session, 0)
             return
-        session.reset(Camera(lambda: tripod.chosen, put_back))
-        tripod.view()
+        session.reset(Camera(lambda: camera.chosen, put_back))
+        camera.view()
 
 
 def add_avoid_and_imitate(gui: viser.GuiApi, bindings: Bindings) -> None:

@@ -11,11 +11,9 @@ from typing import Literal
 from dt_viz.flows.fields import Array
 from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.starts import struck
-from dt_viz.session.session import Session
 from dt_viz.session.teaching import Stroke, board_of
+from dt_viz.ui.host import Host
 from dt_viz.ui.scene.markers import Drag, on_drag
-from dt_viz.ui.scene.robot_scene import RobotScene
-from dt_viz.ui.scene.scene import ScenePictures
 
 LANE = "pen"  # lane of the session's jobs on which the line of a stroke is drawn
 Kind = Literal["draw", "guide"]  # ways of teaching: on the board, or by the ball at the hand
@@ -26,25 +24,19 @@ Finished = Callable[[Stroke, Slice | None], None]
 class Pen:
     """Collects strokes, shows them as they come, and has the arm hold its hand where they are."""
 
-    def __init__(
-        self,
-        pictures: ScenePictures,
-        robot: Callable[[], RobotScene],
-        session: Callable[[], Session],
-        look: Callable[[Slice | None], None],
-    ) -> None:
-        """Wait for `take_up`; `look` moves the camera to face a board, or to where the arm is seen."""
-        self._pictures, self._robot, self._session, self._look = pictures, robot, session, look
+    def __init__(self, page: Host) -> None:
+        """Wait for `take_up` on a page."""
+        self._page = page
         self._changing = threading.Lock()  # the event loop adds points that a job draws
         self._kind: Kind | None = None
         self._area: Slice | None = None
         self._stroke = Stroke()
         self._finished: Finished = lambda _stroke, _area: None
-        on_drag(pictures.board.plate, self._drawn)
+        on_drag(page.pictures.board.plate, self._drawn)
 
     def take_up(self, kind: Kind, finished: Finished) -> None:
         """Begin to teach in a way; called beside the server's event loop. The arm minds no obstacle meanwhile."""
-        robot, session = self._robot(), self._session()
+        robot, session = self._page.robot, self._page.session
         self._stroke, self._finished, self._kind = Stroke(), finished, kind
         self._area = board_of(session.robot) if kind == "draw" else None
         if session.scenario.view.replay:  # its arm cannot be held
@@ -53,19 +45,19 @@ class Pen:
         robot.playback.live.see(None)
         robot.grip.guide(None if kind == "draw" else self._moved)
         robot.set_aside(True)
-        board, theme = self._pictures.board, self._pictures.look.theme
+        board, theme = self._page.pictures.board, self._page.pictures.look.theme
         board.stand(self._area, theme)
         board.ink(self._stroke.points, session.robot, theme)
         board.visible = True
-        self._look(self._area)
+        self._page.face(self._area)
 
     def put_down(self) -> None:
         """End teaching, if it goes on: the arm goes on with its motion, around the obstacles."""
         if self._kind is None:
             return
         self._kind = None
-        robot, session = self._robot(), self._session()
-        self._pictures.board.visible = self._pictures.board.plate.visible = False
+        robot, session = self._page.robot, self._page.session
+        self._page.pictures.board.visible = self._page.pictures.board.plate.visible = False
         robot.grip.guide(None)
         robot.playback.live.release()
         session.engine.see(session.scenario)
@@ -74,7 +66,7 @@ class Pen:
         """End the take that is guided."""
         with self._changing:
             stroke, self._stroke = self._stroke, Stroke()
-        self._session().jobs.submit(LANE, self._ink, latest=True)
+        self._page.session.jobs.submit(LANE, self._ink, latest=True)
         if stroke.moments:
             self._finished(stroke, self._area)
 
@@ -94,10 +86,10 @@ class Pen:
             return
         with self._changing:
             self._stroke.add(time.monotonic(), place, begins=phase == "start")
-        self._robot().playback.live.hold(place)
-        self._session().jobs.submit(LANE, self._ink, latest=True)
+        self._page.robot.playback.live.hold(place)
+        self._page.session.jobs.submit(LANE, self._ink, latest=True)
 
     def _ink(self) -> None:
         with self._changing:
             points = self._stroke.points
-        self._pictures.board.ink(points, self._session().robot, self._pictures.look.theme)
+        self._page.pictures.board.ink(points, self._page.session.robot, self._page.pictures.look.theme)

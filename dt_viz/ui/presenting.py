@@ -25,9 +25,9 @@ import viser
 from dt_viz.ui import patches
 from dt_viz.ui.bindings import Control
 from dt_viz.ui.gate import is_loopback
+from dt_viz.ui.page import Page
 from dt_viz.ui.scene.camera import Framing, Pose, followed, window_size
 from dt_viz.ui.scripts import Window, forget_html, report_window
-from dt_viz.ui.visitor import Visitor
 
 logger = logging.getLogger(__name__)
 
@@ -79,7 +79,7 @@ class Presenter:
 
     client: viser.ClientHandle
     mirror: patches.Mirror
-    visitor: Visitor | None = None  # the page; None until it is built
+    visitor: Page | None = None  # the page; None until it is built
     label: str = ""
     """Title of the panel, with the number of those who watch; empty until it is shown."""
 
@@ -162,7 +162,7 @@ class Lecture:
             before.gui.add_html(forget_html())
         return before
 
-    def begin(self, visitor: Visitor) -> None:
+    def begin(self, visitor: Page) -> None:
         """Take the page of the presenter, which is built."""
         with self._lock:
             if self._presenter is not None and self._presenter.client is visitor.client:

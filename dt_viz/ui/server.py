@@ -25,10 +25,10 @@ from dt_viz.serving.supervisor import listen
 from dt_viz.session.arms import ArmStore
 from dt_viz.ui.gate import LAST_WORDS, Gate, Origins
 from dt_viz.ui.keeping import KEY
+from dt_viz.ui.page import Page, notify
 from dt_viz.ui.presenting import TAKEN, WRONG, Lecture, Viewer
 from dt_viz.ui.scripts import forget_html
 from dt_viz.ui.tabs.status import COLOURS
-from dt_viz.ui.visitor import Visitor, notify
 from dt_viz.warning import Severity
 
 logger = logging.getLogger(__name__)
@@ -95,7 +95,7 @@ class Server:
         """
         listening = listening or listen(host, port)
         titles, arms = {name: entry.title for name, entry in tasks.items()}, ArmStore(tasks, fits, robot)
-        self._new_visitor: Callable[[viser.ClientHandle], Visitor] = lambda client: Visitor(
+        self._new_visitor: Callable[[viser.ClientHandle], Page] = lambda client: Page(
             client,
             arms.engine(),
             robot,
@@ -108,7 +108,7 @@ class Server:
             lambda: self._closed or client.client_id not in self._visitors,
         )
         self._lock = threading.Condition()
-        self._visitors: dict[int, Visitor | None] = {}
+        self._visitors: dict[int, Page | None] = {}
         """Those with a page, and None for those whose page is being built."""
         self._waiting: dict[int, tuple[viser.ClientHandle, viser.GuiMarkdownHandle | None, float]] = {}
         """Those who wait for a place, what their page says meanwhile, and when they came, the first one first."""
@@ -128,7 +128,7 @@ class Server:
         self._server.on_client_disconnect(self._farewell)
 
     @property
-    def visitors(self) -> tuple[Visitor, ...]:
+    def visitors(self) -> tuple[Page, ...]:
         """Visitors with a page of their own."""
         return tuple(visitor for visitor in self._visitors.values() if visitor is not None)
 

@@ -27,8 +27,8 @@ from dt_viz.robot.models import load_jaco
 from dt_viz.scenario.paper_scenes import SCENES, offered
 from dt_viz.scenario.tasks import known_tasks
 from dt_viz.session.frame import Stage
+from dt_viz.ui.page import Page
 from dt_viz.ui.server import Server
-from dt_viz.ui.visitor import Visitor
 from tests.chromium import ARGUMENTS, CHROMIUM
 
 FIRST = "first"  # name of the picture of the first page
@@ -94,14 +94,14 @@ def run(options: argparse.Namespace) -> int:
     return 1 if complaints else 0
 
 
-def _begin(visitor: Visitor, name: str) -> None:
+def _begin(visitor: Page, name: str) -> None:
     """Load a scene, and wait until it is certified."""
     if name in SCENES:
         visitor.session.load(SCENES[name].task, SCENES[name].scenario)
     _until(lambda: visitor.session.wait_idle(0.1) and _is_certified(visitor))
 
 
-def _is_certified(visitor: Visitor) -> bool:
+def _is_certified(visitor: Page) -> bool:
     frame = visitor.shown
     return (
         frame is not None
@@ -110,7 +110,7 @@ def _is_certified(visitor: Visitor) -> bool:
     )
 
 
-def _stop_in_the_middle(visitor: Visitor) -> None:
+def _stop_in_the_middle(visitor: Page) -> None:
     """Let the arm set out from a start, and stop it later."""
     live, frame = visitor.robot.playback.live, visitor.shown
     if frame is None or frame.arm is None or not frame.scenario.view.arm:

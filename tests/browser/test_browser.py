@@ -31,8 +31,8 @@ from scenes import changing
 from dt_viz.metrics import maximum_collision_distance
 from dt_viz.obstacles.shapes import MeshObstacle
 from dt_viz.scenario.tasks import TASKS
+from dt_viz.ui.page import Page
 from dt_viz.ui.scene.slice_layers import VOLUME
-from dt_viz.ui.visitor import Visitor
 
 WIDTH, HEIGHT = 720, 450
 CORNER = (5, 5)  # CSS pixels where the mouse touches nothing
@@ -61,18 +61,18 @@ def visit(tab, initial):
     return page, visitor
 
 
-def look_home(visitor: Visitor) -> None:
+def look_home(visitor: Page) -> None:
     camera = visitor.client.camera
     camera.position, camera.look_at = camera_for(TASKS["draw_s"](), camera)
 
 
-def camera_rests(visitor: Visitor) -> bool:
+def camera_rests(visitor: Page) -> bool:
     camera = visitor.client.camera
     wanted, _ = camera_for(TASKS["draw_s"](), camera)
     return bool(np.abs(np.asarray(camera.position) - wanted).max() < 1e-3)
 
 
-def seen_at(page, visitor: Visitor) -> tuple[float, float]:
+def seen_at(page, visitor: Page) -> tuple[float, float]:
     """CSS pixels of the obstacle."""
     return project(page, visitor, visitor.session.scenario.obstacles[0].position)
 
@@ -97,7 +97,7 @@ def drag_until(page, visitor, done, reset, ends):
     pytest.fail(f"{TRIES} drags in vain, the next would be from and to {ends()}: {visitor.session.scenario}")
 
 
-def assert_shows_the_obstacle_where_it_is(visitor: Visitor) -> None:
+def assert_shows_the_obstacle_where_it_is(visitor: Page) -> None:
     session, frame = visitor.session, visitor.shown
     assert frame is not None
     assert frame.scenario.obstacle == session.scenario.obstacle

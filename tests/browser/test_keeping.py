@@ -24,8 +24,8 @@ from dt_viz.scenario.saved import Known, decode
 from dt_viz.scenario.slices import BASE_PANEL
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui import keeping
+from dt_viz.ui.page import initial
 from dt_viz.ui.panel import HISTORY
-from dt_viz.ui.visitor import initial
 
 pytestmark = [pytest.mark.browser, needs_chromium]
 

@@ -29,7 +29,7 @@ from dt_viz.scenario.tasks import TASKS, TaskEntry, drawing_task
 from dt_viz.scheduler import Rank, Scheduler
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Stage
-from dt_viz.ui.visitor import initial
+from dt_viz.ui.page import initial
 from dt_viz.warning import Kind
 
 PATIENCE = 60

@@ -15,8 +15,8 @@ from dt_viz.evaluate.options import engine_of
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.scenario.stack import with_avoidance
 from dt_viz.scenario.tasks import TASKS
+from dt_viz.ui.page import initial
 from dt_viz.ui.scene.tubes import NUM_SIDES, middles_of, tubes
-from dt_viz.ui.visitor import initial
 
 
 def compiled() -> set[tuple[str, str]]:

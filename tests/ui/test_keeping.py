@@ -27,10 +27,10 @@ from dt_viz.session.session import CHOICES
 from dt_viz.session.teaching import Stroke, board_of
 from dt_viz.ui import keeping, panel
 from dt_viz.ui.keeping import KEY, LANE, PAUSE, PLACES
+from dt_viz.ui.page import initial
 from dt_viz.ui.scene.camera import view_of
 from dt_viz.ui.scripts import Link, Window
 from dt_viz.ui.tabs.status import verdict
-from dt_viz.ui.visitor import initial
 
 PLACE = (0.1, -0.5, 0.4)
 KNOWN = Known((*TITLES, *PLACES), None)
@@ -616,7 +616,7 @@ def test_one_task_too_many_is_refused_and_none_is_lost(opened_for):
     for k in range(MOST_OWN):
         page.session.bring(own(shift=(0.01 * k, 0.0, 0.0)))
     page.settle()
-    page.visitor._panel.resume(page.session, own_of("draw_c"), lambda _saved: None)
+    page.visitor.resume(own_of("draw_c"))
     page.settle()
     again = opened_for(Slow(**page.client.local_storage))
     again.session.bring(own("draw_j"))

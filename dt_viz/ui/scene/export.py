@@ -129,7 +129,7 @@ def decoded(content: bytes, size: tuple[int, int]) -> NDArray[np.uint8]:
         raise FormatError("the browser", "a damaged PNG", accepted) from error
 
 
-class Page(Protocol):
+class StudioPage(Protocol):
     """What a studio uses of a visitor's page."""
 
     client: viser.ClientHandle
@@ -152,7 +152,7 @@ class Page(Protocol):
 class Studio:
     """Makes files of what a page shows; what its browser renders is in light colours, without handles."""
 
-    def __init__(self, page: Page) -> None:
+    def __init__(self, page: StudioPage) -> None:
         self.theme = LIGHT  # theme of the page
         self.drawing = threading.Lock()  # held while a frame is drawn, or a video is made
         self._page, self._renders = page, False

@@ -27,6 +27,8 @@ from dt_viz.session.opening import LENGTHS, USUAL_RATES, Choices, Opened, Previe
 from dt_viz.session.session import Session
 from dt_viz.session.teaching import Stroke, taught
 from dt_viz.ui.bindings import Bindings, Control
+from dt_viz.ui.gate import MAX_UPLOAD
+from dt_viz.ui.host import Host
 from dt_viz.ui.pen import Kind, Pen
 from dt_viz.ui.scene.palette import LIGHT
 from dt_viz.ui.scripts import drop_html
@@ -56,11 +58,6 @@ READINGS = {"t,x,y": "times", "x,y,z": "x, as the next ones are y and z"}
 """What the first of three columns without names is, by the reading of all three."""
 
 
-Show = Callable[[Preview | None, int | None], None]
-"""Function that shows a preview in the scene, and which take of it is chosen. No preview ends it: at once or, with no
-take, when what is wanted is shown."""
-
-
 class OpenPanel:
     """The folder of one visitor's panel, and the button that takes files."""
 
@@ -68,18 +65,16 @@ class OpenPanel:
         self,
         gui: viser.GuiApi,
         bindings: Bindings,
-        show: Show,
+        page: Host,
         learn: Callable[[Session, Task], None],
-        most: int,
         take: Callable[[str, bytes], bool],
-        send: Callable[[str, bytes], None],
     ) -> None:
-        """Build the controls where the panel is being built; files may have `most` bytes together.
+        """Build the controls where the panel is being built; `learn` begins with a task of the visitor's own.
 
-        `take` is given the name and the content of each file first, and returns whether it holds something else; `send`
-        sends a file whose name ends like this, with a content.
+        `take` is given the name and the content of each file first, and returns whether it holds something else.
         """
-        self._bindings, self._show, self._learn, self._most, self._take = bindings, show, learn, most, take
+        self._bindings, self._page, self._learn, self._take = bindings, page, learn, take
+        self.pen = Pen(page)  # what a visitor teaches with
         self._changing = threading.RLock()  # one thread reads, another inspects, and handlers close what is open
         self._opened = Opened()
         self._seen: Preview | None = None  # what is shown of it
@@ -89,11 +84,11 @@ class OpenPanel:
             f"a mesh: {', '.join(suffix[1:] for suffix in MESH_SUFFIXES)}"
         )
         self.upload = gui.add_upload_button("Open a file, or drop it here", icon=viser.Icon.FOLDER_OPEN, hint=hint)
-        gui.add_html(drop_html(self.upload, most))
+        gui.add_html(drop_html(self.upload, MAX_UPLOAD))
         self.folder = gui.add_folder("Your data", visible=False)
         with self.folder:
             self.table = gui.add_html("")
-            self.controls = self._add_controls(gui, send)
+            self.controls = self._add_controls(gui)
             start = gui.add_button(
                 "Learn", color=LIGHT.brand, disabled=True, hint="a motion from the takes that are used"
             )
@@ -117,7 +112,7 @@ class OpenPanel:
         """Act on each value of an input, or press of a button."""
         return Control(handle, lambda value: self.later(partial(act, value)))
 
-    def _add_controls(self, gui: viser.GuiApi, send: Callable[[str, bytes], None]) -> dict[str, Control]:
+    def _add_controls(self, gui: viser.GuiApi) -> dict[str, Control]:
         """Build what is shown only where it is asked for, by names of their own."""
         at, found = self._choose, {}
 
@@ -130,7 +125,8 @@ class OpenPanel:
         button = gui.add_button("Delete this take", icon=viser.Icon.TRASH, color="gray", visible=False)
         found["delete"] = self.control(button, lambda _pressed: self._delete())
         group = gui.add_button_group("Download", tuple(WRITERS), hint="the takes that you have taught", visible=False)
-        found["download"] = self.control(group, lambda kind: send(f"-takes.{kind}", WRITERS[kind](self._opened.kept)))
+        send = lambda kind: self._page.send(f"-takes.{kind}", WRITERS[kind](self._opened.kept))  # noqa: E731
+        found["download"] = self.control(group, send)
         for kind, (name, label, hint) in SWITCHES.items():
             box = gui.add_checkbox(label, True, hint=hint, visible=False)
             found[kind] = self.control(box, lambda on, name=name: at(lambda c: {"preparation": _with(c, name, on)}))
@@ -169,7 +165,8 @@ class OpenPanel:
             self._draw()
             self._put_beside()
             if seen is not None:
-                self._show(None, None if learns else 0)
+                self.pen.put_down()
+                self._page.preview(None, None if learns else 0)
 
     def _learned(self, task: Task | None) -> None:
         """Let go of what was learned from, once its task is shown."""
@@ -194,8 +191,8 @@ class OpenPanel:
                 session.say("A file of yours is being read; open the next one after it.", Severity.WARNING)
             elif is_motion(content):
                 session.jobs.submit(LANE, partial(self._read_motion, name, content))
-            elif size > self._most:
-                accepted = f"at most {self._most / 1e6:.0f} MB; the command line takes more"
+            elif size > MAX_UPLOAD:
+                accepted = f"at most {MAX_UPLOAD / 1e6:.0f} MB; the command line takes more"
                 session.say(f"{name}: files: found {size / 1e6:.1f} MB in all; accepted: {accepted}", Severity.ALARM)
             else:
                 self._opened, self.folder.visible = replace(self._opened, files=files), True
@@ -430,7 +427,7 @@ class OpenPanel:
             choices = () if question is None else (NO_COLUMN, *question.choices)
             self._offer(axis, choices, "" if question is None else question.answer.get(axis, NO_COLUMN))
         self.table.content = seen_html(seen, number)
-        self._show(seen, number)
+        self._page.preview(seen, number)
 
     def _offer(self, name: str, options: tuple[str, ...], value: str) -> None:
         control = self.controls[name]
@@ -463,9 +460,9 @@ TOLD: Mapping[Kind, str] = {
 class TeachPanel:
     """Controls of teaching at the top of the folder "Your data", which takes what was taught."""
 
-    def __init__(self, gui: viser.GuiApi, bindings: Bindings, opening: OpenPanel, pen: Pen) -> None:
+    def __init__(self, gui: viser.GuiApi, bindings: Bindings, opening: OpenPanel) -> None:
         """Build the controls where the panel is being built."""
-        self._bindings, self._opening, self._pen = bindings, opening, pen
+        self._bindings, self._opening = bindings, opening
         hint = "demonstrations of your own: drawn on a board before the arm, or by guiding its hand"
         begin = gui.add_button("Draw your own", icon=viser.Icon.PENCIL, hint=hint, order=opening.upload.order + 0.5)
         with opening.folder:
@@ -477,13 +474,13 @@ class TeachPanel:
             )
         opening.control(begin, lambda _pressed: self._begin("draw"))
         opening.control(ways, lambda name: self._begin(KINDS[name]))
-        opening.control(self._done, lambda _pressed: pen.finish())
-        bindings.show(lambda s: s.arm, lambda _arm: pen.put_down())
+        opening.control(self._done, lambda _pressed: opening.pen.finish())
+        bindings.show(lambda s: s.arm, lambda _arm: opening.pen.put_down())
 
     def _begin(self, kind: Kind) -> None:
         self._opening.teach()
         self._done.visible, self._told.content = kind == "guide", small(html.escape(TOLD[kind]))
-        self._pen.take_up(kind, partial(self._finished, NAMES[kind]))
+        self._opening.pen.take_up(kind, partial(self._finished, NAMES[kind]))
         self._bindings.session.say(TOLD[kind], Severity.NOTE)
 
     def _finished(self, name: str, stroke: Stroke, board: Slice | None) -> None:

@@ -14,6 +14,7 @@ from dt_viz.scheduler import checkpoint
 from dt_viz.session.session import Session
 from dt_viz.ui import patches
 from dt_viz.ui.bindings import Bindings, Control
+from dt_viz.ui.host import Host
 from dt_viz.ui.scene.camera import HAND, HOME, VIEWS, CameraController, Framing
 from dt_viz.ui.scene.export import FORMATS, MOTION, RESOLUTIONS, TURNTABLE, WARP, Order
 from dt_viz.ui.scene.figure import Step
@@ -96,15 +97,12 @@ class PictureTab:
         self,
         gui: viser.GuiApi,
         bindings: Bindings,
-        tripod: CameraController,
+        page: Host,
         presentation: Presentation,
-        darken: Callable[[bool], None],
         enlarge: Callable[[bool], None],
-        draw: Callable[[Order, Step, Cancelled], bytes],
-        send: Callable[[str, bytes], None],
     ) -> None:
-        """Build the controls where the panel is being built; `draw` makes a file, `send` sends it."""
-        self._tripod = tripod
+        """Build the controls where the panel is being built; `enlarge` shows large type, or the usual one."""
+        self._tripod = tripod = page.camera
         gui.add_html(patches.ROW)
         Control(gui.add_button_group("View", (*VIEWS, HAND, HOME), hint="where the camera looks from"), tripod.view)
 
@@ -116,7 +114,7 @@ class PictureTab:
         lock = box("Lock camera", "no drag, wheel or key moves the camera; its views, the orbit and another scene do")
         self._lock = Control(lock, partial(setattr, tripod, "locked"))
         dark = box("Dark theme", "for a dark room; pictures that are saved stay light")
-        self._dark = bindings.later(dark, lambda _session, on: darken(on))
+        self._dark = bindings.later(dark, lambda _session, on: page.darken(on))
         big = box("Big type", "larger type and controls in a wider panel, to be read from afar")
         self._big = Control(big, enlarge)
         hint = "the scene and a caption alone"
@@ -139,10 +137,10 @@ class PictureTab:
         def make(_session: Session, step: Step, cancelled: Cancelled) -> tuple[str, bytes]:
             suffix, size = f".{self._format.value.lower()}", RESOLUTIONS[self._resolution.value]
             is_clear = self._transparent.value and self._format.value == PNG
-            return suffix, draw(Order(suffix, size, is_clear, self._what.value), step, cancelled)
+            return suffix, page.studio.picture(Order(suffix, size, is_clear, self._what.value), step, cancelled)
 
         hint = "of the scene, as a file; press again to cancel"
-        self._save = SaveButton(gui, bindings, SAVE_PICTURE, make, send, icon=viser.Icon.CAMERA, hint=hint)
+        self._save = SaveButton(gui, bindings, SAVE_PICTURE, make, page.send, icon=viser.Icon.CAMERA, hint=hint)
 
     @property
     def commands(self) -> list[Command]:

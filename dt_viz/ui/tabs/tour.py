@@ -13,8 +13,8 @@ from dt_viz.session import player
 from dt_viz.session.session import CHOICES, Session
 from dt_viz.ui import keeping
 from dt_viz.ui.bindings import Bindings
-from dt_viz.ui.keeping import Storage
-from dt_viz.ui.scene.camera import CameraController, Pose
+from dt_viz.ui.host import Host
+from dt_viz.ui.scene.camera import Pose
 from dt_viz.ui.scene.palette import LIGHT, css
 from dt_viz.ui.scripts import arrows_html
 from dt_viz.ui.tabs.plots import small
@@ -36,26 +36,16 @@ Begin = Callable[[Callable[[Session, str], None], Session, str], None]
 class Tour:
     """The tour of one visitor: shows its steps in place of his scenario, which he has again at the end."""
 
-    def __init__(
-        self,
-        gui: viser.GuiApi,
-        bindings: Bindings,
-        tripod: CameraController,
-        begin: Begin,
-        storage: Storage | None,
-        came_back: Callable[[Pose | None], None],
-    ) -> None:
+    def __init__(self, gui: viser.GuiApi, bindings: Bindings, page: Host, begin: Begin) -> None:
         """Build the controls where the panel is being built.
 
         Args:
             gui: the panel's.
             bindings: those of the panel.
-            tripod: the visitor's camera.
+            page: what the tour is shown on; its camera is as before when the tour ends.
             begin: has something begun beside the server's event loop; see `ControlPanel.choose`.
-            storage: what the browser keeps; None if it keeps nothing.
-            came_back: told the pose that the camera had before the tour, None as it began, when that ends.
         """
-        self._tripod, self._begin, self._storage, self._came_back = tripod, begin, storage, came_back
+        self._page, self._begin, self._storage = page, begin, page.client.local_storage
         self.number: int | None = None
         """Number of the step that is shown, from 0; None outside the tour."""
         self.pose: Pose | None = None  # pose that the camera had before the tour; None as it began
@@ -76,8 +66,7 @@ class Tour:
 
     def begin(self, session: Session) -> None:
         """Ask the browser whether the tour is to be offered, or which step was shown before a reload."""
-        if self._storage is not None:
-            session.jobs.submit(LANE, partial(self._ask, session, self._storage))
+        session.jobs.submit(LANE, partial(self._ask, session))
 
     def take(self, session: Session, number: int = 0) -> None:
         """Begin the tour at a step, from 0, or go to it."""
@@ -103,8 +92,8 @@ class Tour:
         self.number = None
         self._write()
         _stop_playing(session)
-        self._tripod.view()
-        self._came_back(self.pose)
+        self._page.camera.view()
+        self._page.came_back(self.pose)
         session.come_back()
         self._keep(OVER)
 
@@ -118,14 +107,14 @@ class Tour:
         self._offer.visible = False
         self._keep(OVER)
 
-    def _ask(self, session: Session, storage: Storage) -> None:
+    def _ask(self, session: Session) -> None:
         """Ask the browser until it tells; what no page has written is as nothing."""
         found = None
         for _ in range(keeping.ATTEMPTS):
             if session.jobs.superseded(LANE):
                 return
             try:
-                found = storage.get_item(KEY, timeout=keeping.PATIENCE)
+                found = self._storage.get_item(KEY, timeout=keeping.PATIENCE)
                 break
             except TimeoutError:
                 continue
@@ -146,7 +135,7 @@ class Tour:
 
     def _go(self, session: Session, number: int) -> None:
         if self.number is None:
-            self.pose = self._tripod.chosen
+            self.pose = self._page.camera.chosen
         self.number = number
         self._write()
         self._begin(partial(self._visit, number), session, "")
@@ -155,7 +144,7 @@ class Tour:
         if self.number != number:  # ended meanwhile
             return
         _stop_playing(session)
-        self._tripod.view()
+        self._page.camera.view()
         session.visit(TASK, STEPS[number].scenario)
         self._keep(NUMBERS[number])
         if STEPS[number].grows:
@@ -178,8 +167,7 @@ class Tour:
             self._buttons.options = (*(BACK,) * (number > 0), *(NEXT,) * (number < len(STEPS) - 1), END)
 
     def _keep(self, text: str) -> None:
-        if self._storage is not None:
-            self._storage.set_item(KEY, text)
+        self._storage.set_item(KEY, text)
 
 
 def _stop_playing(session: Session) -> None:

@@ -1,4 +1,15 @@
-"""The page of one visitor: a private scene, panel and session, tied together."""
+"""The page of one visitor: a private scene, panel and session, tied together.
+
+The trip of a drag, from the browser and back:
+
+1. `scene.draggables` takes the new place on the server's event loop, checked, and calls `Session.edit`.
+2. `Session.edit` puts it into the frozen scenario and submits that; the newest replaces what waits.
+3. A thread of the session's jobs waits for its slot of `scheduler`, and iterates over `Engine.frames`.
+4. `motion.solve` stacks the transforms on what was learned, and computes the rollouts; the arm follows one of them.
+5. `Page.draw` gives the frame to `ScenePictures` and `RobotScene`, which change what differs in viser's scene.
+6. `Page.adopt` shows the scenario on the controls, and `ControlPanel.report` the figures of the frame.
+7. The field, finer rollouts and certificates come as frames of later stages, unless a newer edit waits.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +18,6 @@ import time
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
 from types import MappingProxyType
 
 import numpy as np
@@ -33,9 +43,9 @@ from dt_viz.session.opening import Preview
 from dt_viz.session.progress import Display, Pace, Progress
 from dt_viz.session.session import Session
 from dt_viz.ui.bindings import EDITS
+from dt_viz.ui.host import Host
 from dt_viz.ui.keeping import Keeper
 from dt_viz.ui.panel import ControlPanel
-from dt_viz.ui.pen import Pen
 from dt_viz.ui.playback import Playback
 from dt_viz.ui.scene.camera import CameraController, Pose
 from dt_viz.ui.scene.export import Studio
@@ -82,8 +92,8 @@ def notify(client: viser.ClientHandle, text: str, colour: Colour, seconds: float
     client.add_notification("DT-Viz", text, color=colour, auto_close_seconds=seconds)
 
 
-class Visitor(Display):
-    """Shows a session in the browser of one visitor."""
+class Page(Display, Host):
+    """A visitor's scene, panel and session; what controls use of it is `host.Host`."""
 
     def __init__(
         self,
@@ -119,32 +129,14 @@ class Visitor(Display):
             self.pictures = ScenePictures(client.scene, robot, lambda: self.session)
             self.robot = RobotScene(client, robot, Playback(engine.arm, self._pose))
             self.studio = Studio(self)
-            pen = Pen(self.pictures, lambda: self.robot, lambda: self.session, self._face)
             self.camera = CameraController(client, lambda: self.robot.hand, robot.size, self._keeper.changed)
-            self._panel = ControlPanel(
-                client.gui,
-                titles,
-                robot,
-                titled,
-                self.studio.picture,
-                self._send,
-                partial(notify, client, seconds=BRIEF),
-                self.camera,
-                self._darken,
-                partial(self._preview, pen),
-                self._save,
-                self._open,
-                pen,
-                client.local_storage,
-                self._came_back,
-                {name: partial(self._resume, saved) for name, saved in scenarios.items()},
-            )
+            self._panel = ControlPanel(self, titles, titled, robot, scenarios)
         begun = self._keeper.begun
         at_once = None if begun is None or _takes_long(begun) else begun.scenario
         begins_like = lambda engine, name: initial(engine.task(name))  # noqa: E731
         self.session = Session(engine, begins_like, task, self, arms and arms.engine, at_once)
         self._panel.connect(self.session)
-        self._keeper.begin(self.session, self._resume)
+        self._keeper.begin(self.session, self.resume)
         self._panel.tour.begin(self.session)
         self.robot.playback.begin(self.session.jobs, self.session.fail)
 
@@ -217,37 +209,34 @@ class Visitor(Display):
         own = None if scenario.task in tasks else Own.of(task)
         return Saved(scenario, _sight(pose), own, None if task.lesson == lesson else lesson)
 
-    def _came_back(self, pose: Pose | None) -> None:
-        """Have the camera where it was before the tour or Reset, with the visitor's own scenario."""
+    def came_back(self, pose: Pose | None) -> None:
         self._keeper.go_on(Saved(self.session.own, _sight(pose)))
 
-    def _resume(self, saved: Saved) -> None:
-        self._panel.resume(self.session, saved, self._keeper.go_on)
+    def resume(self, saved: Saved) -> None:
+        self._panel.resume(saved)
 
-    def _save(self, session: Session) -> None:
-        """Send the scenario as a file, beside the server's event loop, or say why that cannot be."""
+    def began(self, saved: Saved) -> None:
+        self._keeper.go_on(saved)
+
+    def save(self) -> None:
 
         def send() -> None:
             try:
                 content = encode(self._made(TASKS)).encode()
             except DataError as error:
-                session.say(str(error), Severity.ALARM)
+                self.session.say(str(error), Severity.ALARM)
             else:
-                self._send(".json", content)
+                self.send(".json", content)
 
-        session.jobs.submit(EDITS, send)
+        self.session.jobs.submit(EDITS, send)
 
-    def _open(self, name: str, content: bytes) -> bool:
-        """Go on with the scenario that a file holds; return whether it holds one. Raises as `decode`."""
+    def open(self, name: str, content: bytes) -> bool:
         if not is_saved(content):
             return False
-        self._resume(self._keeper.read(content, name))
+        self.resume(self._keeper.read(content, name))
         return True
 
-    def _preview(self, pen: Pen, seen: Preview | None, number: int | None) -> None:
-        """Show takes that are not learned yet in place of the motion; see `ui.tabs.opening.Show`."""
-        if seen is None:
-            pen.put_down()
+    def preview(self, seen: Preview | None, number: int | None) -> None:
         if number is None:
             self._previews = None
         elif seen is None:
@@ -271,8 +260,7 @@ class Visitor(Display):
             self.camera.look(self.shown.task, tuple(panel.shown for panel in self.shown.pictures.panels))
         self.client.flush()
 
-    def _face(self, board: Slice | None) -> None:
-        """Move the camera straight before a board, or to where all is seen."""
+    def face(self, board: Slice | None) -> None:
         if self.shown is not None:
             self.camera.look(self.shown.task, () if board is None else (board,))
 
@@ -311,8 +299,7 @@ class Visitor(Display):
             dark_mode=theme is DARK, show_logo=False, show_share_button=False, brand_color=LIGHT.brand
         )
 
-    def _darken(self, dark: bool) -> None:
-        """Begin the dark theme, or the light one, on the panel and in the scene."""
+    def darken(self, dark: bool) -> None:
         self.studio.theme = DARK if dark else LIGHT
         self._dress(self.studio.theme)
         self.studio.paint()
@@ -322,6 +309,9 @@ class Visitor(Display):
         """Whether takes that are not learned yet are seen in place of the motion."""
         return self._previews is not False
 
-    def _send(self, suffix: str, content: bytes) -> None:
+    def notify(self, text: str, colour: Colour) -> None:
+        notify(self.client, text, colour, seconds=BRIEF)
+
+    def send(self, suffix: str, content: bytes) -> None:
         name = "-".join(filter(None, ("dt-viz", self.session.scenario.task, self.session.scenario.arm)))
         self.client.send_file_download(f"{name}{suffix}", content, save_immediately=True)
