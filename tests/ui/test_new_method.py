@@ -15,11 +15,11 @@ from dt_viz.errors import never
 from dt_viz.evaluate.__main__ import main
 from dt_viz.scenario.saved import Saved, decode, encode
 from dt_viz.session.frame import Stage
+from dt_viz.ui.page import known_names
 from dt_viz.ui.scene.comparison import ComparedMotions
 from dt_viz.ui.scene.palette import LIGHT
 from dt_viz.ui.scene.picture import Look
 from dt_viz.ui.tabs.plots import SAVE
-from dt_viz.ui.visitor import known_names
 
 SHIFT = np.array([0.0, 0.0, 0.03])
 
